@@ -9,6 +9,7 @@ setting that a message recommends has a plus, ⟨+lens.size⟩, and the command 
 import difflib
 import re
 from collections.abc import Iterable, Sequence
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 
 #: A marked path.
 MARK = re.compile(r"⟨(\+?[a-z_.]+)⟩")
@@ -53,6 +54,16 @@ def alternatives(names: Sequence[str]) -> str:
     """Names as a clause: "a, b or c"."""
     *others, last = names
     return f"{', '.join(others)} or {last}" if others else last
+
+
+def at_most(value: float, digits: int) -> str:
+    """A limit to this number of digits, rounded so that a value of the text does not exceed it."""
+    return f"{float(Context(digits, ROUND_FLOOR).create_decimal(repr(float(value)))):.{digits}g}"
+
+
+def at_least(value: float, digits: int) -> str:
+    """The same for a limit from below."""
+    return f"{float(Context(digits, ROUND_CEILING).create_decimal(repr(float(value)))):.{digits}g}"
 
 
 class CausticError(Exception):

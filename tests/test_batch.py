@@ -13,7 +13,7 @@ from helpers import small_designs, write_blob
 from rich.console import Console
 
 from caustic_cli import cli
-from caustic_cli.commands.console import Reporter, ended_row
+from caustic_cli.commands.console import Reporter, ended_words
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.project import checkpoint
 from caustic_cli.studies.radius import cost_of_radius
@@ -315,9 +315,9 @@ def test_an_interruption_before_the_first_checkpoint_says_what_is_kept(capfd, mo
 
 
 def test_how_a_design_ended_is_said_in_words():
-    assert ended_row("iterations") == ("ended", "after all its iterations")
-    assert ended_row("no progress; its start was better and is kept")[1].endswith("progress; its start was better and is kept")
-    assert ended_row("no wave image")[1] == "no wave image"
+    assert ended_words("iterations") == "after all its iterations"
+    assert ended_words("no progress; its start was better and is kept").endswith("progress; its start was better and is kept")
+    assert ended_words("no wave image") == "no wave image"
 
 
 @pytest.mark.parametrize(

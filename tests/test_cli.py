@@ -298,18 +298,25 @@ def test_the_others_print_one_object_too(here, capfd, text):
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "result"),
     [
-        "design blob.png --force --resolution 24 --control 12 --rays 4000 --iterations 1",
-        "render blob.caustic --rays 2000",
-        "gradmap blob.caustic --rays 2000",
-        "export blob.caustic --force",
+        ("design blob.png --force --resolution 24 --control 12 --rays 4000 --iterations 1", "relative RMS error"),
+        ("render blob.caustic --rays 2000", "relative RMS error"),
+        ("render blob.caustic --rays 2000 --explain", "normal incidence"),
+        ("gradmap blob.caustic --rays 2000", "largest pixel"),
+        ("export blob.caustic", " bytes"),
+        ("convergence blob.caustic --study rays --rays 2000 --repeats 2", "advice"),
     ],
 )
-def test_quiet_is_silent_and_stdout_is_for_results(here, capfd, text):
-    assert run(text + " --quiet", capfd) == (0, "", "")
-    code, out, err = run(text, capfd)
-    assert (code, out) == (0, "") and err != ""
+def test_quiet_is_silent_and_stdout_is_for_results(here, capfd, text, result):
+    """The closing table; a repeated command prints it again.  With --json one object stands there instead."""
+    code, out, err = run(text + " --quiet", capfd)
+    assert (code, err) == (0, "") and result in out and "\x1b" not in out
+    code, again, err = run(text, capfd)
+    assert code == 0 and result in again and result not in err
+    assert err != "" or text.startswith(("gradmap", "convergence"))  # these have nothing to say
+    code, out, err = run(text + " --json", capfd)
+    assert code == 0 and isinstance(json.loads(out), dict) and out.count("\n") == 1 and result not in err
 
 
 @pytest.mark.parametrize(
@@ -332,8 +339,23 @@ def test_what_it_made_it_replaces_unasked(here, capfd, text):
 def test_the_table_names_the_file_whole(here, capfd):
     """Piped to a log there is no window to fit: a path cut short is a path lost."""
     name = "a-rather-long-name-" * 6 + ".png"
-    _, _, err = run(f"render blob.caustic --rays 1000 -o {name}", capfd)
-    assert name in err
+    _, out, _ = run(f"render blob.caustic --rays 1000 -o {name}", capfd)
+    assert name in out
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_the_table_fits_a_terminal_and_any_encoding(monkeypatch, capfd, encoding):
+    """Values are folded beside their names; what an encoding lacks is escaped, and control characters do nothing."""
+    rows = [("lost", "a clause of nine words, µ, that is folded " * 4), ("image", "/no\x1b[2J\udcff.png")]
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.stdout, "isatty", lambda: True)
+        patch.setenv("COLUMNS", "50")
+        sys.stdout.reconfigure(encoding=encoding)
+        console.Reporter().table("a title", rows)
+    sys.stdout.reconfigure(encoding="utf-8")
+    lines = capfd.readouterr().out.splitlines()
+    assert len(lines) > 5 and max(map(len, lines)) <= 50 + 3 * (encoding == "ascii")
+    assert all(line.startswith("         ") for line in lines[2:-1]) and lines[-1] == "  image  /no?[2J?.png"
 
 
 def test_render_traces_the_rays_of_the_verdict_and_keeps_the_better_picture(here, capfd, monkeypatch):
@@ -556,10 +578,10 @@ def test_several_formats_at_once_and_the_format_of_a_suffix(here, capfd):
     assert [e["format"] for e in json.loads(out)["exports"]] == ["step", "stl", "heightmap"]
     assert run("export blob.caustic -o named.stl --tolerance 0.01 --quiet", capfd)[0] == 0
     assert Path("named.stl").read_bytes() == Path("blob.stl").read_bytes()
-    code, _, err = run("export blob.caustic -o named.stp", capfd)
-    assert code == 0 and "heights are at most a nanometre off" in err and "; --tolerance 0 writes the exact one" in err
-    code, _, err = run("export blob.caustic --format step --tolerance 0 -o exact.step", capfd)
-    assert code == 0 and "bytes, the spline itself" in err and Path("exact.step").stat().st_size > Path("named.stp").stat().st_size
+    code, out, _ = run("export blob.caustic -o named.stp", capfd)
+    assert code == 0 and "heights are at most a nanometre off" in out and "; --tolerance 0 writes the exact one" in out
+    code, out, _ = run("export blob.caustic --format step --tolerance 0 -o exact.step", capfd)
+    assert code == 0 and "bytes, the spline itself" in out and Path("exact.step").stat().st_size > Path("named.stp").stat().st_size
     assert Path("named.stp").read_text().startswith("ISO-10303-21;")
 
 

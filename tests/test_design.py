@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -238,8 +239,14 @@ def test_a_design_is_never_worse_than_its_start(capfd):
     """Steps far too long wreck a good start: it is kept, and the run still goes on from where the optimiser stands."""
     options = [*TINY[:2], "--control", "35", *TINY[4:], "--start", "transport", "--optimizer", "adam", "--lr", "0.5"]
     once = design(capfd, "blob.png", *options, "--iterations", 6, "-o", "once")
-    assert once["reason"] == "iterations; its start was better and is kept"
-    assert once["relative_rms"] == once["start_relative_rms"]
+    words = re.fullmatch(
+        r"iterations; its start was better and is kept: relative RMS error by (rays|waves) ([\d.]+), after the iterations ([\d.]+),"
+        r" with ([\d.]+)% and ([\d.]+)% of the light on the screen",
+        once["reason"],
+    )
+    assert words[1] == once["error_by"] and words[2] == f"{once['error']:.4f}" and float(words[2]) < float(words[3])
+    assert float(words[4]) == pytest.approx(100 * once["wave_on_screen" if words[1] == "waves" else "on_screen"], abs=0.01)
+    assert once["relative_rms"] == once["start_relative_rms"] and once["error"] == once["start_error"]
     state = load("once").state
     assert torch.equal(state.heights, state.start)
     design(capfd, "blob.png", *options, "--iterations", 12, "-o", "whole")

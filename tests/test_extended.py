@@ -16,18 +16,21 @@ from PIL import Image
 from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
 from caustic_cli.config import settings
+from caustic_cli.errors import at_most
 from caustic_cli.inverse import source_limits
-from caustic_cli.inverse.deconvolution import deconvolved
+from caustic_cli.inverse.deconvolution import _cells, deconvolved, error_bound
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.source_limits import etendue_limit, performance_limits, point_source, regular_rays, source_spread
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.emission.coherent import modes, vogel_disc
+from caustic_cli.optics.emission.coherent import modes, outermost_modes, vogel_disc
 from caustic_cli.optics.emission.regular import RegularGrid
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import Convolution, Spread
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.trace import expose
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.studies.metrics import relative_rms
@@ -267,10 +270,73 @@ def test_etendue_of_light_that_does_not_fill_the_lens(light):
     assert on_screen > 0.3 and on_screen / entered < etendue_limit(scene) <= 1.0
 
 
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (30.0, 0.0), (-20.0, 40.0)])
+@pytest.mark.parametrize("kind", SOURCES)
+def test_the_image_of_the_source_through_a_point_of_the_lens(kind, tilt):
+    """By rays through a lens with relief: light of the outermost points of the source lands within the images that are said."""
+    scene = scene_of(SOURCES[kind])
+    scene = replace(scene, screen=replace(scene.screen, tilt=tilt))
+    field, heights = HeightField.of(scene.lens), heights_of(scene)
+    system, images = System.of(scene, field), source_images(scene)
+    exit_x, exit_y = (torch.tensor(v, dtype=torch.float64) for v in ([0.0, 0.6, -0.5, 0.3], [0.0, 0.2, -0.7, 0.9]))
+
+    def landing(mode):
+        u, v = (exit_x / 2.0 + 0.5, exit_y / 2.0 + 0.5)
+        for _ in range(4):  # until it leaves the lens there
+            tracer = Tracer(system, mode.through(u, v, 1.0))
+            left = tracer.last({EXIT: heights}).state.expanded()
+            at = left.full(left.origin)
+            u, v = u - (at[0] - exit_x) / 2.0, v - (at[1] - exit_y) / 2.0
+        state = Tracer(system, mode.through(u, v, 1.0)).land({EXIT: heights}, scene.screen)[0].expanded()
+        return torch.stack(state.full(state.origin)[:2])
+
+    right, left, up, down = (landing(mode) for mode in outermost_modes(scene))
+    moved = np.stack([((right - left) / 2).numpy(), ((up - down) / 2).numpy()], -1)  # (2, rays, 2): axis, ray, side of the source
+    for ray in moved.transpose(1, 0, 2):
+        off = []
+        for image in images:
+            (hx, hy), (a, b) = image.half, image.skew
+            sign = np.sign(np.diag(ray))
+            off.append(np.linalg.norm(ray - np.array([[hx, a * hy], [b * hx, hy]]) * sign, 2) / np.linalg.norm(ray, 2))
+        assert min(off) < 0.06
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (30.0, 0.0), (-20.0, 40.0)])
+@pytest.mark.parametrize("kind", ["sun", "disc"])
+def test_no_lens_is_better_than_the_bound(kind, tilt):
+    """The picture that a lens throws of a point: its own image of the source is no closer to it than the bound, which is not
+    vacuous, on a tilted screen as on an upright one."""
+    scene = scene_of(SOURCES[kind])
+    scene = replace(scene, screen=Screen((6.0, 6.0), 60.0, (48, 48), tilt))
+    field, heights = HeightField.of(scene.lens), heights_of(scene, relief=8e-3)
+    point = replace(scene, source=point_source(scene))
+    target = expose(point, field, heights, rays_of(point, "sobol", 1 << 18)).image.numpy()
+    image = expose(scene, field, heights, rays_of(scene, "sobol", 1 << 18)).image.numpy()
+    error, limits = relative_rms(image, target), performance_limits(scene, target)
+    assert 0.8 * error < limits.error < error
+    colours = performance_limits(scene, np.stack([target, 0.0 * target, target[::-1]]))
+    assert 0.5 * limits.error < colours.error < 2.0 * limits.error  # the mean over those with light
+
+
+def test_several_blurs_allow_for_more_than_one():
+    """The error of the best sum of two is bounded from below by no more than either's, and reached by none alone."""
+    target, one, two = disc_on(24), spread(0.3), spread(0.4)
+    alone, both = (error_bound(target, blurs, 400) for blurs in ([one], [one, two]))
+    assert 0.5 * alone < both <= alone * 1.001
+    assert error_bound(target, [one], 400) == pytest.approx(deconvolved(target, one, 400).bound)
+    mixed = 0.5 * (one(_cells(torch.from_numpy(target), one)) + two(_cells(torch.from_numpy(target), two)))
+    assert error_bound(mixed.numpy(), [one, two], 400) < 0.02  # such a picture has no least error
+
+
 def test_limits_in_words():
     scene = scene_of(SOURCES["sun"])
-    words = performance_limits(scene, disc_on(32)).sentence()
-    assert "relative RMS" in words and "etendue" in words and len(words.splitlines()) == 1
+    limits = performance_limits(scene, disc_on(32))
+    words = limits.sentence()
+    assert (
+        f"relative RMS error of less than {at_most(limits.error, 3)}" in words
+        and "etendue" in words
+        and len(words.splitlines()) == 1
+    )
     assert performance_limits(scene_of(PlaneWave()), disc_on(32)).sentence() == ""
 
 

@@ -67,7 +67,9 @@ def test_a_gradient_index_plate_is_designed_saved_and_rendered(capfd):
     assert "cannot be resumed" in run(capfd, "design", "--resume", "free.caustic", code=2)
     movie = ("design", "blob.png", "--gradient", "free", *TINY, "-o", "moving.caustic", "--movie", "m.gif")
     assert "--movie records the design of a surface" in run(capfd, *movie, code=2) and not Path("moving.caustic").exists()
-    assert run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] == 84 + 50 * 14  # a box, of which two triangles are a side
+    assert (
+        run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] == 84 + 50 * 14
+    )  # a box, of which two triangles are a side
     assert "varies" in run(capfd, "export", "free.caustic", "--format", "lighttools", code=2)
     assert "varies" in run(capfd, "gradmap", "free.caustic", "--threads", "1", code=2)
     far = ("--source", "point", "--source-position", "0,0,-1e6")  # a design needs a plane wave, an image any light

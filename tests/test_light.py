@@ -271,6 +271,7 @@ def test_study_of_light(tmp_path, monkeypatch, capfd):
     capfd.readouterr()
     assert cli.run(["convergence", "blob.caustic", "--study", "light", "--seconds", "0.2", "--json", "--quiet"]) == 0
     found = json.loads(capfd.readouterr().out)
+    assert found["error_by"] == "rays"
     assert [p.rsplit("/", 1)[-1] for p in found["files"]] == ["light.csv", "light.json", "light.png"]
     rows = found["rows"]
     assert len({r["thickness"] for r in rows}) == 2 and {r["loss"] for r in rows} == {"rms", "rms + 10 light"}

@@ -471,9 +471,11 @@ def test_an_archive_as_cut(tmp_path, monkeypatch, capfd):
     write_lighttools("lens.npz", scene, field, heights)
     write_gcode("lens.nc", part_of("gcode", scene, field, heights), Milling(scallop=0.01))
     assert cli.run(shlex.split("render lens.npz --rays 20000 --effects none --cut lens.nc --json")) == 0
-    out, err = capfd.readouterr()
-    f = json.loads(out)
-    assert f["cut"]["cut_left_mm"] < 0.011 and "left on the surface" in err
+    f = json.loads(capfd.readouterr().out)
+    assert f["cut"]["cut_left_mm"] < 0.011 and f["error"] is f["error_by"] is f["cut"]["nominal_error"] is None  # no picture
+    assert cli.run(shlex.split("render lens.npz --rays 20000 --effects none --cut lens.nc")) == 0
+    out = capfd.readouterr().out
+    assert "left on the surface" in out and out.count("relative RMS error") == 1
     assert f["on_screen"] + math.fsum(f["lost"].values()) == pytest.approx(1.0, abs=1e-9)
     Path("lens.nc").write_text(Path("lens.nc").read_text().replace("ball nose, radius 2 mm", "some tool"))
     assert cli.run(shlex.split("render lens.npz --rays 20000 --cut lens.nc")) == 2

@@ -270,7 +270,7 @@ def test_the_command_writes_what_it_prints(tmp_path, monkeypatch, capfd):
         told = json.loads(Path("report.json").read_text())
         assert told.pop("created_by") == "caustic" and told == json.loads(out)["report"]
     assert cli.run(shlex.split("render lens.npz --rays 1000 --effects fresnel --report")) == 0
-    assert "concave radius" in capfd.readouterr().err
+    assert "concave radius" in capfd.readouterr().out
     assert cli.run(shlex.split("render lens.npz --rays 1000 --tool-radius 3")) == 2
 
 

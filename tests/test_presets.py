@@ -143,6 +143,7 @@ def test_what_is_said_before_a_design_begins(monkeypatch):
 def test_figures_are_json(capfd):
     write_blob("blob.png", 16, (5, 6), 15.0)
     assert cli.run(["design", "blob.png", "--glass", "Plexiglass", *SMALL]) == 0
+    capfd.readouterr()
     assert cli.run(["render", "blob.caustic", "--report", "--json", "--quiet", "--rays", "1e4"]) == 0
     report = json.loads(capfd.readouterr().out)["report"]
     assert report["mass_g"] == pytest.approx(1.19 * report["volume_cm3"])

@@ -338,6 +338,7 @@ def test_a_profile_weights_the_light(designed, tmp_path, monkeypatch, capfd):
     Image.fromarray(np.full((8, 8), 200, dtype=np.uint8)).save("even.png")
     (tmp_path / "c.toml").write_text("[source]\nprofile = 'half.npy'\n" + CONFIG.replace("iterations = 4", "iterations = 1"))
     assert cli.run(["design", "even.png", "--config", "c.toml", "--start", "offset", "--quiet"]) == 0
+    capfd.readouterr()
     assert np.array_equal(np.load("even.caustic/profile.npy"), profile)
     figures, image = render(tmp_path / "even.caustic", capfd)
     assert image[:8].sum() < 1e-3 * image.sum() < image[12:].sum()

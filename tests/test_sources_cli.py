@@ -85,6 +85,7 @@ def test_every_source_designs_renders_and_exports(capfd, source):
         assert file["source_positions"].shape[1] == 3 and len(file["source_positions"]) == (0 if far else len(file["source_power"]))
         assert file["source_power"].sum() == pytest.approx(1.0)
         assert float(file["cone_half_angle"]) > 0
+    capfd.readouterr()
     assert cli.run(["gradmap", "blob.caustic", "--control", "5,5", "--rays", "20000", "--check", "--quiet", "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["maps"][0]["check"]["relative_error"] < 1e-4
 

@@ -15,6 +15,7 @@ from helpers import begun, small_designs
 from PIL import Image
 
 from caustic_cli import cli
+from caustic_cli.commands.console import figures_rows
 from caustic_cli.config import completion
 from caustic_cli.config.default_stages import LEAST_WAVES, WAVES, wave_refinement
 from caustic_cli.errors import InputError
@@ -247,12 +248,34 @@ def test_a_design_for_light(_here, capfd):
     rays = design(capfd, "blob.png", *SMALL, "--waves", "off", "-o", "rays")
     assert "wave_relative_rms" not in rays and not Path("rays/wave.png").exists()
     waves = design(capfd, "blob.png", *SMALL, "-o", "waves")
-    judged = json.loads(_render(capfd, "rays"))
+    judged = json.loads(_render(capfd, "rays", "--rays", "40000"))
+    assert (rays["error"], rays["error_by"]) == (rays["relative_rms"], "rays") and judged["error_by"] == "rays"
+    assert judged["error"] == judged["relative_rms"] == pytest.approx(rays["error"], rel=0.1)  # the same headline
+    (name, first), *others = figures_rows(judged)
+    assert (name, first.split()[:3]) == ("relative RMS error", [f"{judged['error']:.4f}", "by", "rays,"])
+    assert f"relative RMS error {judged['wave_relative_rms']:.4f}" in dict(others)["wave image"]
+    asked = json.loads(_render(capfd, "rays", "--effects", "fresnel,diffraction"))  # who asks for waves is told of them
+    assert (asked["error"], asked["error_by"]) == (asked["wave_relative_rms"], "waves")
     assert waves["wave_relative_rms"] < 0.6 * judged["wave_relative_rms"]
     assert waves["wave_relative_rms"] < 0.6 * waves["start_wave_relative_rms"]
     assert waves["wave_on_target"] > 0.93 * waves["wave_on_screen"] and waves["resolvable"] <= 32
     assert len(waves["wave_wavelengths"]) == 6 and Path("waves/wave.png").exists()
     again = json.loads(_render(capfd, "waves"))
+    for one in (waves, again):
+        assert (one["error"], one["error_by"]) == (one["wave_relative_rms"], "waves") and one["wave_psnr_db"] > one["psnr_db"]
+        rows = figures_rows(one)
+        assert rows[0][1].startswith(f"{one['error']:.4f} by waves") and rows[-1][0] == "by rays alone"
+        assert f"{one['relative_rms']:.4f}" in rows[-1][1] and "no fault" in rows[-1][1]
+        of = dict(rows)
+        assert of["PSNR"] == f"{one['wave_psnr_db']:.2f} dB" and of["SSIM"] == f"{one['wave_ssim']:.4f}"
+        assert (
+            of["light in black"] == f"{one['wave_in_black']:.2%}" and of["light on the picture"] == f"{one['wave_on_target']:.2%}"
+        )
+        assert of["image"] == "waves/wave.png; by rays waves/render.png"
+    assert (
+        waves["start_error"] == waves["start_wave_relative_rms"]
+        and f"{waves['start_error']:.4f}" in dict(figures_rows(waves))["of the initial surface"]
+    )
     assert again["wave_relative_rms"] == pytest.approx(waves["wave_relative_rms"], rel=0.03)
     assert again["wave_image"] == "waves/wave.png" and "relative_rms" in again
     assert cli.run(["render", "waves", "--rays", "4000", "--quiet", "--npy", "ray.npy", "-o", "ray.png"]) == 0
@@ -263,7 +286,7 @@ def test_a_design_for_light(_here, capfd):
     assert cli.run(["export", "waves", "--format", "lighttools", "-o", "lens.npz", "--quiet"]) == 0
     capfd.readouterr()
     assert cli.run(["render", "lens.npz", "--rays", "4000", "--effects", "diffraction"]) == 0
-    assert re.search(r"wave image +on the screen 99", capfd.readouterr().err) and Path("lens-render-wave.png").exists()
+    assert re.search(r"wave image +on the screen 99", capfd.readouterr().out) and Path("lens-render-wave.png").exists()
     none = json.loads(_render(capfd, "waves", "--effects", "fresnel"))
     assert "wave_relative_rms" not in none and not Path("waves/wave.png").exists() and Path("ray-wave.png").exists()
     design(capfd, "blob.png", *SMALL, "-o", "waves")  # the same again is no work, but what is missing is made

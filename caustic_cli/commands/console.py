@@ -1,4 +1,4 @@
-"""Console output: results to stdout, messages and progress to stderr.
+"""Console output: results to stdout, as tables or as one JSON object; messages and progress to stderr.
 
 Results are not printed through Rich, which wraps lines at 80 columns when piped.
 """
@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import sys
+import textwrap
 import threading
 import time
 from contextlib import contextmanager
@@ -23,7 +25,6 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
 from rich.text import Text
 
 from caustic_cli.config.table import TABLE
@@ -33,8 +34,8 @@ from caustic_cli.errors import LISTS, MARK, InputError, plain_name, shortened
 LINE_EVERY = 0.5
 #: Keys of the figures of a network's lens that are not values of its inputs.
 OF_LENS = ("relative_rms", "noise", "on_screen", "of_source", "middle_relative_rms")
-#: Terminal width from which on a progress bar and the time elapsed are shown.
-WIDE = 90
+#: Terminal width from which on a progress bar and the time elapsed are shown, and least width of the values of a table there.
+WIDE, NARROW = 90, 24
 
 
 class _TimeLeft(ProgressColumn):
@@ -47,19 +48,20 @@ class _TimeLeft(ProgressColumn):
 
 
 class Reporter:
-    """Messages to the user on stderr, unless `quiet`.  Colour follows the terminal and NO_COLOR.
+    """Messages to the user on stderr, unless `quiet`; results on stdout, unless `as_json`: a JSON object stands for them there.
+    Colour follows the terminal and NO_COLOR.
 
-    With `progress` json the output is for programs: one JSON object per line, with the `event` message, progress or result.
+    With `progress` json stderr is for programs: one JSON object per line, with the `event` message, progress or result.
 
     Raises:
         InputError: `progress` is neither auto nor json.
     """
 
-    def __init__(self, quiet: bool = False, progress: str = "auto"):
+    def __init__(self, quiet: bool = False, progress: str = "auto", as_json: bool = False):
         if progress not in ("auto", "json"):
             raise InputError(f"--progress must be auto or json, got {progress!r}")
         self.console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
-        self.lines = progress == "json"
+        self.lines, self.as_json = progress == "json", as_json
 
     def say(self, text: str) -> None:
         """Print a message."""
@@ -74,21 +76,22 @@ class Reporter:
             sys.stderr.write(json.dumps(values) + "\n")
             sys.stderr.flush()
 
+    def result(self, *lines: str) -> None:
+        """Print lines of results."""
+        if not self.as_json:
+            for line in lines:
+                emit(named(line))
+
     def table(self, title: str, rows: list[tuple[str, str]]) -> None:
-        """Print a table of names and values."""
+        """Print a table of names and values as results; on a terminal, values are folded beside their names."""
         if self.lines:
             self._line(event="result", title=title, rows=dict(rows))
-            return
-        if not self.console.is_terminal:  # a log: no wrapping or truncation
-            width = max(len(name) for name, _ in rows)
-            self.say("\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in rows)]))
-            return
-        table = Table(title=title, show_header=False, title_justify="left", title_style="bold")
-        table.add_column(no_wrap=True)
-        table.add_column(overflow="fold")
+        width = max(len(name) for name, _ in rows)
+        wide = max(NARROW, shutil.get_terminal_size().columns - width - 4) if sys.stdout.isatty() else math.inf
+        self.result(title)
         for name, value in rows:
-            table.add_row(name, value)
-        self.console.print(table)
+            folded = textwrap.wrap(value, int(wide)) if len(value) > wide else [value]
+            self.result(*(f"  {label:<{width}}  {part}" for label, part in zip((name, *("",) * len(folded)), folded, strict=False)))
 
     @contextmanager
     def notify_if_slow(self, text: str, seconds: float = 4.0):
@@ -200,14 +203,20 @@ def emit_json(value: dict) -> None:
 
 
 def emit(line: str) -> None:
-    """Print a line of results on stdout."""
-    sys.stdout.write(line + "\n")
+    """Print a line of results on stdout, with control characters replaced, and those escaped that its encoding lacks."""
+    encoding = sys.stdout.encoding or "utf-8"
+    sys.stdout.write(printable(line).encode(encoding, "backslashreplace").decode(encoding) + "\n")
     sys.stdout.flush()
 
 
+def printable(text: str) -> str:
+    """A text with control characters replaced, for instance those of a malicious file name."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
 def error(message: str) -> None:
-    """Print one line on stderr, even if quiet, with control characters replaced, for instance in a malicious file name."""
-    line = "".join(c if c.isprintable() else "?" for c in " ".join(named(message).split()))
+    """Print one line on stderr, even if quiet, with control characters replaced."""
+    line = printable(" ".join(named(message).split()))
     sys.stderr.write(f"caustic: {shortened(line)}\n")
 
 
@@ -219,10 +228,10 @@ ENDED = {
 }
 
 
-def ended_row(reason: str) -> tuple[str, str]:
-    """The row of a table that says why a design ended."""
+def ended_words(reason: str) -> str:
+    """Why a design ended."""
     first, *more = reason.split("; ", 1)
-    return "ended", "; ".join([ENDED.get(first, first), *more])
+    return "; ".join([ENDED.get(first, first), *more])
 
 
 def _wavelengths(values: list[float]) -> str:
@@ -232,116 +241,163 @@ def _wavelengths(values: list[float]) -> str:
     return f"at {len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
 
 
-def _absolute(figures: dict, prefix: str) -> list[tuple[str, str]]:
-    """Peak and mean of the image on the screen, in its unit."""
-    if figures.get(f"{prefix}peak_irradiance") is None:
-        return []
-    unit = figures["irradiance_unit"]
+def figures_rows(figures: dict) -> list[tuple[str, str]]:
+    """The figures of merit as rows for display: the judged figure, then those of the same image; those of the other image, by rays
+    or by waves, in one row that says so, which stands last where waves judge."""
+    by_waves = figures.get("error_by") == "waves"
     return [
-        (
-            "illuminance" if unit == "lux" else "irradiance",
-            f"peak {figures[prefix + 'peak_irradiance']:.4g} {unit}, mean {figures[prefix + 'mean_irradiance']:.4g} {unit}",
-        )
+        ("relative RMS error", _error(figures, by_waves)),
+        *_of_start(figures),
+        *_limits(figures),
+        *([] if by_waves else [("loss (eq. 5.2.1)", _number(figures, "loss", ".4e"))]),
+        *_of_image(figures, "wave_" if by_waves else ""),
+        *_of_radius(figures),
+        *_behind(figures),
+        ("lost, by rays" if by_waves else "lost", _lost(figures)),
+        *_of_glass(figures),
+        *([] if by_waves else _wave_image(figures)),
+        *([("details resolved", _number(figures, "resolvable", "d") + " across")] if "resolvable" in figures else []),
+        ("rays", _number(figures, "rays", ",d")),
+        *([] if by_waves else _noise_of_image(figures)),
+        ("iterations", _number(figures, "iterations", "d")),
+        ("time", _number(figures, "seconds", ".1f") + " s"),
+        ("image", f"{figures['wave_image']}; by rays {figures['image']}" if by_waves else str(figures["image"])),
+        *([("ended", ended_words(figures["reason"]))] if "reason" in figures else []),
+        *([("by rays alone", _rays_alone(figures))] if by_waves else []),
     ]
 
 
-def figures_rows(figures: dict) -> list[tuple[str, str]]:
-    """The figures of merit as rows for display."""
+def _number(figures: dict, key: str, form: str) -> str:
+    value = figures.get(key)
+    return "-" if value is None else format(value, form)
 
-    def number(key: str, form: str) -> str:
-        value = figures.get(key)
-        return "-" if value is None else format(value, form)
 
-    lost = ", ".join(f"{name.replace('_', ' ')} {value:.2%}" for name, value in figures["lost"].items() if value > 5e-7)
-    own = figures.get("noise")
-    of_rays, noise = "" if own is None else f", noise {own:.2g}", []
-    if figures.get("error_estimate") is not None:
-        in_all = f"; {figures['rays_traced']:,} rays in all" if "rays_traced" in figures else ""
-        noise = [("noise of the image", f"{figures['error_estimate']:.2g}, estimated{in_all}")]
-    black = []
-    if figures.get("in_black") is not None:
-        known = figures.get("in_black_noise")
-        black = [("light in black", number("in_black", ".2%") + ("" if known is None else f", noise {known:.2%}"))]
-    radius = figures.get("min_radius")
-    if radius is not None and radius["in_black_per_mm"] is not None:
-        from caustic_cli.studies.radius import cost_of_radius  # noqa: PLC0415
+def _noise(figures: dict, key: str, form: str = ".2g") -> str:
+    """The noise of a figure as a clause, empty where it is unknown."""
+    return "" if figures.get(key) is None else f", noise {figures[key]:{form}}"
 
-        with_it, without = radius["start_in_black"], radius["start_in_black_without"]
-        seen = f"first surface {with_it:.2%} in black, {without:.2%} without: {cost_of_radius(radius)}"
-        black += [(f"a radius of {radius['radius_mm']:g} mm", seen)]
-    error, waves = [("relative RMS error", number("relative_rms", ".4f") + of_rays)], []
-    if "no_wave_image" in figures:
-        waves = [("wave image", f"none: {figures['no_wave_image']}")]
-    elif "wave_relative_rms" in figures:
-        seen = f"on the picture {number('wave_on_target', '.2%')}"
-        if figures.get("wave_in_black") is not None:
-            seen += f", in black {number('wave_in_black', '.2%')}"
-        if figures["wave_relative_rms"] is None:  # an archive has no target picture
-            seen = f"on the screen {number('wave_on_screen', '.2%')}"
-        else:  # where light is a wave its error comes first, since that of the rays says little of it
-            of_waves = f"{number('wave_relative_rms', '.4f')} of the wave image, {_wavelengths(figures['wave_wavelengths'])}"
-            error = [("relative RMS error", of_waves), ("of the rays alone", error[0][1])]
-        waves = [
-            ("wave image", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
-            *((f"{name} as a wave", value) for name, value in _absolute(figures, "wave_")),
-            ("details resolved", number("resolvable", "d") + " across"),
-        ]
-    behind = []
-    if figures.get("second_relative_rms") is not None:
-        value, known = number("second_relative_rms", ".4f"), figures.get("second_noise")
-        behind = [
-            ("second picture", f"relative RMS error {value}" + ("" if known is None else f", noise {known:.2g}")),
-            ("light on it", number("second_on_target", ".2%")),
-        ]
-    elif figures.get("angle_rms_mrad") is not None:
-        behind = [("directions off by", number("angle_rms_mrad", ".3g") + " mrad rms")]
-    least = (
-        [("least possible", number("least_relative_rms", ".4f") + ", behind the source's blur")]
-        if "least_relative_rms" in figures
-        else []
-    )
-    start = []
-    if figures.get("start_relative_rms") is not None:
-        known = f", noise {figures['start_noise']:.2g}" if "start_noise" in figures else ""
-        start = [("of the initial surface, by rays", f"{figures['start_relative_rms']:.4f}{known}")]
+
+def _error(figures: dict, by_waves: bool) -> str:
+    """The judged figure and its judge."""
+    if by_waves:
+        return f"{_number(figures, 'wave_relative_rms', '.4f')} by waves, {_wavelengths(figures['wave_wavelengths'])}"
+    beside = " by rays" if figures.get("wave_relative_rms") is not None else ""
+    return _number(figures, "relative_rms", ".4f") + beside + _noise(figures, "noise")
+
+
+def _wavelengths(values: list[float]) -> str:
+    """Wavelengths as a clause."""
+    if len(values) == 1:
+        return f"at {values[0]:.4g} nm"
+    return f"at {len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
+
+
+def _of_start(figures: dict) -> list[tuple[str, str]]:
+    """Errors of the initial surface, and of the lenses of a network."""
+    rows = []
+    if figures.get("start_error") is not None:
+        noise = "" if figures["error_by"] == "waves" else _noise(figures, "start_noise")
+        rows = [("of the initial surface", f"{figures['start_error']:.4f}{noise}")]
     for row in figures.get("over", ()):
         values = ", ".join(f"{key} {row[key]:g}" for key in row if key not in OF_LENS)
-        known = "" if row["noise"] is None else f", noise {row['noise']:.2g}"
-        start.append(
-            (f"lens for {values}", f"{row['relative_rms']:.4f}{known}; that for the middle {row['middle_relative_rms']:.4f}")
-        )
+        middle = f"that for the middle {row['middle_relative_rms']:.4f}"
+        rows.append((f"lens for {values}", f"{row['relative_rms']:.4f}{_noise(row, 'noise')}; {middle}"))
+    return rows
+
+
+def _limits(figures: dict) -> list[tuple[str, str]]:
+    """What an extended source allows."""
+    rows = []
+    if "least_relative_rms" in figures:
+        rows = [("least possible", _number(figures, "least_relative_rms", ".4f") + " or more for any lens, by the source's blur")]
     if "etendue_limit" in figures:
-        least.append(("etendue limit", number("etendue_limit", ".2%") + " of the light on the lens"))
-    return [
-        *error,
-        *start,
-        *least,
-        ("loss (eq. 5.2.1)", number("loss", ".4e")),
-        ("PSNR", number("psnr_db", ".2f") + " dB"),
-        ("SSIM", number("ssim", ".4f")),
-        (
-            "light on the screen",
-            number("on_screen", ".2%") + (f" of {figures['fractions_of']}" if "fractions_of" in figures else ""),
-        ),
-        ("light on the picture", number("on_target", ".2%")),
-        *(
-            [("of all the source emits", f"{100.0 * figures['of_source']:.3g}%: {figures['source_emits']}")]
-            if figures.get("of_source") is not None
-            else []
-        ),
-        *black,
-        *behind,
-        ("lost", lost or "nothing"),
-        *(
-            [("glass", f"wall {figures['minimum_wall_mm']:.2f} mm, stock {figures['stock_height_mm']:.2f} mm")]
-            if "stock_height_mm" in figures
-            else []
-        ),
-        *_absolute(figures, ""),
-        *waves,
-        ("rays", number("rays", ",d")),
-        *noise,
-        ("iterations", number("iterations", "d")),
-        ("time", number("seconds", ".1f") + " s"),
-        ("image", str(figures["image"])),
+        rows.append(("etendue limit", _number(figures, "etendue_limit", ".2%") + " of the light on the lens"))
+    return rows
+
+
+def _of_image(figures: dict, prefix: str) -> list[tuple[str, str]]:
+    """Figures of the ray image, or of the wave image with the prefix wave_."""
+    of = f" of {figures['fractions_of']}" if "fractions_of" in figures else ""
+    rows = [
+        ("PSNR", _number(figures, f"{prefix}psnr_db", ".2f") + " dB"),
+        ("SSIM", _number(figures, f"{prefix}ssim", ".4f")),
+        ("light on the screen", _number(figures, f"{prefix}on_screen", ".2%") + of),
+        ("light on the picture", _number(figures, f"{prefix}on_target", ".2%")),
     ]
+    if figures.get("of_source") is not None:
+        rows.append(("of all the source emits", f"{100.0 * figures['of_source']:.3g}%: {figures['source_emits']}"))
+    if figures.get(f"{prefix}in_black") is not None:
+        noise = "" if prefix else _noise(figures, "in_black_noise", ".2%")
+        rows.append(("light in black", _number(figures, f"{prefix}in_black", ".2%") + noise))
+    if figures.get(f"{prefix}peak_irradiance") is not None:
+        name = "illuminance" if figures["irradiance_unit"] == "lux" else "irradiance"
+        rows.append((name, _irradiance(figures, prefix)))
+    return rows
+
+
+def _irradiance(figures: dict, prefix: str) -> str:
+    """Peak and mean of an image on the screen, in its unit."""
+    return ", ".join(f"{k} {figures[f'{prefix}{k}_irradiance']:.4g} {figures['irradiance_unit']}" for k in ("peak", "mean"))
+
+
+def _of_radius(figures: dict) -> list[tuple[str, str]]:
+    """What a least radius costs."""
+    from caustic_cli.studies.radius import cost_of_radius  # noqa: PLC0415
+
+    radius = figures.get("min_radius")
+    if radius is None or radius["in_black_per_mm"] is None:
+        return []
+    with_it, without = radius["start_in_black"], radius["start_in_black_without"]
+    words = f"first surface {with_it:.2%} in black, {without:.2%} without: {cost_of_radius(radius)}"
+    return [(f"a radius of {radius['radius_mm']:g} mm", words)]
+
+
+def _behind(figures: dict) -> list[tuple[str, str]]:
+    """Figures behind the picture."""
+    if figures.get("second_relative_rms") is not None:
+        error = f"relative RMS error {figures['second_relative_rms']:.4f}{_noise(figures, 'second_noise')}"
+        return [("second picture", error), ("light on it", _number(figures, "second_on_target", ".2%"))]
+    if figures.get("angle_rms_mrad") is not None:
+        return [("directions off by", _number(figures, "angle_rms_mrad", ".3g") + " mrad rms")]
+    return []
+
+
+def _lost(figures: dict) -> str:
+    return ", ".join(f"{k.replace('_', ' ')} {value:.2%}" for k, value in figures["lost"].items() if value > 5e-7) or "nothing"
+
+
+def _of_glass(figures: dict) -> list[tuple[str, str]]:
+    if "stock_height_mm" not in figures:
+        return []
+    return [("glass", f"wall {figures['minimum_wall_mm']:.2f} mm, stock {figures['stock_height_mm']:.2f} mm")]
+
+
+def _wave_image(figures: dict) -> list[tuple[str, str]]:
+    """The wave image where it is not the judge."""
+    if "no_wave_image" in figures:
+        return [("wave image", f"none: {figures['no_wave_image']}")]
+    if "wave_wavelengths" not in figures:
+        return []
+    at = _wavelengths(figures["wave_wavelengths"])
+    if figures["wave_relative_rms"] is None:  # an archive has no target picture
+        return [("wave image", f"on the screen {_number(figures, 'wave_on_screen', '.2%')}, {at}")]
+    words = f"relative RMS error {_number(figures, 'wave_relative_rms', '.4f')}, {at}"
+    words += f"; on the picture {_number(figures, 'wave_on_target', '.2%')}"
+    if figures.get("wave_in_black") is not None:
+        words += f", in black {_number(figures, 'wave_in_black', '.2%')}"
+    return [("wave image", f"{words}; the design was not refined on it")]
+
+
+def _noise_of_image(figures: dict) -> list[tuple[str, str]]:
+    if figures.get("error_estimate") is None:
+        return []
+    in_all = f"; {figures['rays_traced']:,} rays in all" if "rays_traced" in figures else ""
+    return [("noise of the image", f"{figures['error_estimate']:.2g}, estimated{in_all}")]
+
+
+def _rays_alone(figures: dict) -> str:
+    """Figures of the ray image of a lens that waves judge, and why they are no fault of it."""
+    return (
+        f"relative RMS error {_number(figures, 'relative_rms', '.4f')}{_noise(figures, 'noise')}, light on the picture"
+        f" {_number(figures, 'on_target', '.2%')}; no fault of the lens, which was refined for the diffraction that rays leave out"
+    )

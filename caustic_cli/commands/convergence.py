@@ -21,6 +21,8 @@ EXAMPLES = """Examples:
 STUDIES = ("intersection", "rays", "reconstruction", "precision", "effects", "design", "diffraction", "light")
 #: Studies that use --rays for their largest setting also in --study all.
 BY_RAYS = ("rays", "reconstruction", "precision", "effects")
+#: Studies whose errors are those of lenses against the picture, as of a design; others compare images with each other.
+OF_LENSES = ("design", "networks", "light")
 
 
 def run(
@@ -90,7 +92,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Measure errors and computing times for many settings."""
-    began, say = time.monotonic(), console.Reporter(quiet, progress)
+    began, say = time.monotonic(), console.Reporter(quiet, progress, json)
     if study not in (*STUDIES, "all"):
         raise InputError(f"--study must be one of {', '.join(STUDIES)} or all, got {study!r}")
     if networks and study != "design":
@@ -158,6 +160,8 @@ def _show(found, paths: list[Path], say: console.Reporter) -> None:
     ]
     if "source" in found.about:
         rows.insert(0, ("rays", f"{found.about['rays']:,} from {found.about['source']}"))
+    if found.name in OF_LENSES:
+        rows.insert(0, ("errors", "against the picture, by rays"))
     say.table(
         f"{found.name}: fitted orders" if found.orders else found.name,
         [*rows, ("advice", found.advice), ("written", ", ".join(map(str, paths)))],
@@ -167,6 +171,7 @@ def _show(found, paths: list[Path], say: console.Reporter) -> None:
 def _as_json(found, paths: list[Path]) -> dict:
     return {
         "study": found.name,
+        **({"error_by": "rays"} if found.name in OF_LENSES else {}),
         "advice": found.advice,
         "rows": found.rows,
         "files": [str(p) for p in paths],

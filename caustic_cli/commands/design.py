@@ -67,7 +67,7 @@ def run(
 ) -> None:
     """Compute the lens whose caustic is the picture TARGET."""
     speaks = checks.rank_and_size()[0] == 0  # under torchrun, rank 0
-    say = console.Reporter(quiet or not speaks, progress)
+    say = console.Reporter(quiet or not speaks, progress, json)
     iterations, time_limit = given.get("design.iterations"), given.get("design.time_limit")
     if iterations is not None and not 1 <= iterations <= 10**9:
         raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
@@ -87,7 +87,7 @@ def run(
         refuse_unwritable(movie, force)
     if not resume and speaks:
         from caustic_cli.config.presets import path_of  # noqa: PLC0415
-        from caustic_cli.config.settings import refuse_unused  # noqa: PLC0415
+        from caustic_cli.config.settings import by_section, implied, refuse_unused  # noqa: PLC0415
         from caustic_cli.config.values import refuse_bad_file, refuse_bad_options  # noqa: PLC0415
         from caustic_cli.io.files import read_stdin  # noqa: PLC0415
         from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, read_picture  # noqa: PLC0415
@@ -101,7 +101,7 @@ def run(
             refuse_bad_file(config, parameters=True)
         refuse_bad_options(given)
         if config is None and preset is None:
-            refuse_unused({"type": given.get("source.type", default("source.type"))}, given)
+            refuse_unused({"type": default("source.type")} | implied(by_section(given)).get("source", {}), given)
         picture = read_stdin(ACCEPTED, MAX_BYTES) if piped else target
         if config is None:  # a configuration may set its encoding
             read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
@@ -128,7 +128,7 @@ def run(
             lens = library.design_of(
                 picture, given, preset=preset, config=config, out=path, force=force, movie=movie, say=say, device=device
             )
-    say.table(lens.figures["project"], [*console.figures_rows(lens.figures), console.ended_row(lens.figures["reason"])])
+    say.table(lens.figures["project"], console.figures_rows(lens.figures))
     if json:
         console.emit_json(lens.figures)
 

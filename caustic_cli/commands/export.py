@@ -92,7 +92,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Write the lens of PROJECT in the formats of other programs."""
-    say = console.Reporter(quiet)
+    say = console.Reporter(quiet, as_json=json)
     if project is None:
         listed = ", ".join(f"{name} ({suffix})" for name, (suffix, _, _) in FORMATS.items())
         raise InputError(f"a project is needed, and a --format or an --out with its suffix, of {listed}")
@@ -133,14 +133,12 @@ def run(
         given = {
             key: v for key, v in given_of.items() if v is not None and name in options_of.get(f"--{key}", (True, ("gcode",)))[1]
         }
-        figures, reused = export(exporter, opened, name, output, script and name == "lighttools", given, force, at)
+        figures, _ = export(exporter, opened, name, output, script and name == "lighttools", given, force, at)
         all_figures.append(figures)
-        if reused:
-            continue
         words = accuracy_words(figures)
-        say.say(f"{figures['file']}: {figures['bytes']:,} bytes{f', {words}' if words else ''}")
+        say.result(f"{figures['file']}: {figures['bytes']:,} bytes{f', {words}' if words else ''}")
         for file in figures.get("beside", ()):
-            say.say(f"{file}: {Path(file).stat().st_size:,} bytes")
+            say.result(f"{file}: {Path(file).stat().st_size:,} bytes")
         if "milling" in figures:
             from caustic_cli.studies.scallops import rows  # noqa: PLC0415
 

@@ -56,7 +56,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Compute the derivative of the image with respect to a control height, by one forward-mode pass."""
-    began, say = time.monotonic(), console.Reporter(quiet)
+    began, say = time.monotonic(), console.Reporter(quiet, as_json=json)
     count = options.rays("--rays", rays)
     size = options.both(options.counts("--filter-size", filter_size))
     points = [options.indices("--control", text) for text in control or []]

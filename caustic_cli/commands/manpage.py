@@ -33,7 +33,9 @@ optimised by differentiable ray tracing until the irradiance on the screen match
 taken into account where it matters.
 .PP
 Lengths are in millimetres, angles in degrees, wavelengths in nanometres and powers in watts.  Results are written to standard
-output, messages to standard error.
+output, as tables or with
+.B \-\-json
+as one JSON object; messages are written to standard error.
 .SH COMMANDS
 """
 
@@ -74,8 +76,12 @@ With
 .BR \-\-json ,
 design and render print one object with the following keys, among others.  Undefined values are null.
 .TP
+.B error, error_by
+The figure by which the lens is judged, and by what: waves, for a design that was refined on its wave image (wave_relative_rms), or
+rays (relative_rms).
+.TP
 .B loss, relative_rms, psnr_db, ssim
-Comparison of image and target, with rays counted in pixels: the loss of eq. 5.2.1 of the thesis; that loss times the number of
+Comparison of ray image and target, with rays counted in pixels: the loss of eq. 5.2.1 of the thesis; that loss times the number of
 pixels, which is the RMS error divided by the mean; peak signal\-to\-noise ratio; structural similarity.
 .TP
 .B in_black
@@ -104,24 +110,25 @@ Fraction of all that the source emits which lands on the picture, and what that 
 or a disc at infinity; all rays of a ray file; for a point, grid or disc its Lambertian or tabulated distribution in all directions,
 and for a uniform one the cone if that is given, else all directions; for several sources that of all together.
 .TP
-.B wave_relative_rms, wave_on_target, wave_in_black, resolvable
+.B wave_relative_rms, wave_psnr_db, wave_ssim, wave_on_screen, wave_on_target, wave_in_black, resolvable
 The same quantities for the wave image, where diffraction is simulated; number of details across the picture that the light can
 resolve.
 .TP
 .B least_relative_rms, etendue_limit
-For an extended source: the least error found behind its blur, and the largest fraction of the light that \['e]tendue permits.
+For an extended source: a lower bound of the error of any lens, by its blur, and the largest fraction of the light that
+\['e]tendue permits.
 .TP
 .B second_relative_rms, second_noise, second_on_target, second_on_screen, second_of_source, second_image
 The same quantities for a second picture behind the first; if the light is to continue parallel or towards a focus instead,
 .BR angle_rms_mrad ,
 the root mean square of its angular deviation.
 .TP
-.B start_relative_rms, start_noise
+.B start_error, start_relative_rms, start_noise
 The same quantities for the initial surface of a design, by the same rays.
 .TP
 .B tolerances
-For a tolerance study: draws, percentiles p5, p50 and p95 of relative_rms (as placed), shifted_relative_rms (after the best
-shift of the screen) and on_target, sensitivities, offenders, wave_check, csv, plot.
+For a tolerance study: draws, error_by, percentiles p5, p50 and p95 of error (as placed; also as relative_rms),
+shifted_relative_rms (after the best shift of the screen) and on_target, sensitivities, offenders, wave_check, csv, plot.
 .TP
 .B want
 For an array with a prescribed illumination: brightness of each lenslet's source relative to the largest, N lists of M; error, the

@@ -28,7 +28,7 @@ LISTS = {
 }
 #: Parameters of mallopt(3), from glibc's malloc.h.
 TRIM_THRESHOLD, MMAP_MAX = -1, -4
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
+Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout instead of the table.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Print nothing on stderr except errors.")]
 Debug = Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]

@@ -143,7 +143,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Trace the lens of PROJECT; write the irradiance image and its figures of merit."""
-    say = console.Reporter(quiet, progress)
+    say = console.Reporter(quiet, progress, json)
     count = None if rays is None else options.rays("--rays", rays)
     if tolerance is not None and not 0 < tolerance < 100:
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {tolerance:g}")
@@ -202,8 +202,7 @@ def run(
         at,
     )
     figures = render(asked, device, say)
-    if not figures.pop("reused", False):
-        _show(str(project), figures, say)
+    _show(str(project), figures, say)
     if json:
         console.emit_json(figures)
     if verify and not figures["verify"]["agree"]:
@@ -220,7 +219,7 @@ def _show(title: str, figures: dict, say: console.Reporter) -> None:
     if "effects" in figures:
         from caustic_cli.studies.effects import table  # noqa: PLC0415
 
-        say.say("\n".join(table(figures["effects"])))
+        say.result(*table(figures["effects"]))
     if "report" in figures:
         from caustic_cli.studies.manufacture import rows  # noqa: PLC0415
 

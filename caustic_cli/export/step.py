@@ -189,12 +189,13 @@ def write_step(
 
 
 def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
-    """Fractions of the poles of files of at most `limit` bytes, the smallest first; the smallest of all where none fits."""
+    """Fractions of the poles of files of at most `limit` bytes, the smallest first: all poles, as a solid for CAD is expected to
+    have, if they fit; the smallest fraction of all where none does."""
     solids, decimals = _solids(scene, field, heights, None, 1.0)
     sizes = [math.prod(f.shape) * _bytes(f, h, decimals or 0) for solid in solids for f, h in solid.sides]
     own = sum(sizes[: len(solids[0].sides)])
     fits = [part for part in reversed(PARTS) if part * own + sum(sizes) - own <= limit]
-    return [{"poles": part} for part in reversed(fits)] or [{"poles": PARTS[0]}]
+    return [{"poles": part} for part in reversed(fits) if fits[0] < 1.0 or part == 1.0] or [{"poles": PARTS[0]}]
 
 
 def readings(scene: Scene, field: HeightField, heights: Tensor, tolerance: float | None = None, poles: float = 1.0) -> Readings:

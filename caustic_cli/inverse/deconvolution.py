@@ -5,18 +5,22 @@
 K is the convolution with the source's image and S the restriction to the screen: b is the picture on the screen, x the irradiance
 on the screen and on the margin from which light is still spread onto it.  Accelerated projected gradients with restarts (Beck and
 Teboulle, SIAM J. Imaging Sci. 2, 2009; O'Donoghue and Candes, Found. Comput. Math. 15, 2015); the multiplier c of the mean
-constraint is added to b and updated by mean(y).
+constraint is added to b and updated by mean(y).  Where the image of the source differs over the lens and the screen, y is the sum
+of several S K x.
 
-Weak duality gives a lower bound for every nu: with w = K^T S^T 1 and N pixels,
+Weak duality gives a lower bound for every nu: with w = K^T S^T 1 and N pixels, nu . y <= N t, t = max_i (K^T S^T nu)_i / w_i over
+all K, for any x, and with the Cauchy-Schwarz inequality and nu less its mean, which changes nothing else,
 
-    |y - b|^2 / 2 >= nu . b - |nu|^2 / 2 - N max_i (K^T S^T nu)_i / w_i
+    |y - b| >= (nu . b - N t) / |nu|
 
-for any x, which is tight for nu = b + c - y at the optimum.
+which is tight for nu = b + c - y at the optimum.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,15 +31,18 @@ from caustic_cli.optics.spread import Convolution
 
 #: Iterations after which x is returned (early stopping keeps it smooth) and of the search for the least error; interval of its
 #: checks.
-SMOOTH_STEPS, MOST_STEPS, LOOK = 60, 3000, 50
-#: Budget of iterations times cells, about a second, and least number of iterations.
+SMOOTH_STEPS, MOST_STEPS, LOOK = 60, 1000, 50
+#: Budget of iterations times cells, about a second, and least number of iterations; the same for the bound alone, a few seconds.
 WORK, LEAST_STEPS = 3e7, 300
+BOUND_WORK, BOUND_STEPS = 1e8, 100
 #: Most cells per pixel along each axis.
 FINEST = 2
-#: Relative gap between error and bound at which the iterations end.
-TIGHT = 0.02
+#: Relative gap between error and bound at which the iterations end, and an error that is as good as none.
+TIGHT, NO_ERROR = 0.02, 1e-3
 #: Cells of which no more than this fraction, rounding, reaches the screen are left out.
 REACHES = 1e-9
+#: Least fraction of a cell's light on the screen by which steps are divided where the bound alone is asked for.
+LEAST_REACH = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,43 +69,100 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int | None = Non
         spread: convolution with the source's image on the target's pixels.
         steps: iterations; None for about a second of them.
     """
-    cut, b = spread.cut, torch.from_numpy(target / target.mean())
-    pixels = tuple(n // cut for n in spread.beside)
-    around = (spread.beside[1],) * 2 + (spread.beside[0],) * 2
-
-    def cells(v: Tensor) -> Tensor:
-        return torch.nn.functional.pad(v.repeat_interleave(cut, 0).repeat_interleave(cut, 1), around)
-
-    def seen(x: Tensor) -> Tensor:
-        return spread(x) / cut**2
-
-    def back(v: Tensor) -> Tensor:  # the adjoint, times cut^2: the step of the gradient on cells
-        return spread.whole(cells(v), adjoint=True)
-
-    steps = steps or int(min(MOST_STEPS, max(LEAST_STEPS, WORK / cells(b).numel())))
-    reach = back(torch.ones_like(b))
-    near = reach > REACHES
-    x = cells(b)
-    ahead, t, c, light, kept, least, bound = x, 1.0, 0.0, None, 1.0, math.inf, 0.0
-    for k in range(1, steps + 1):
-        y = seen(ahead)
-        moved = torch.where(near, (ahead + back(b + c - y)).clamp_min(0.0), 0.0)
-        c += 0.5 * (1.0 - float(y.mean()))
-        if float(((ahead - moved) * (moved - x)).sum()) > 0.0:
-            t = 1.0
-        after = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * t * t))
-        ahead, x, t = moved + (t - 1.0) / after * (moved - x), moved, after
+    b, cut = torch.from_numpy(target / target.mean()), spread.cut
+    steps = steps or _budget(b, [spread], WORK, LEAST_STEPS)
+    light, kept, least, bound = np.zeros_like(target), 1.0, math.inf, 0.0
+    for k, ((x,), c) in enumerate(itertools.islice(_iterates(b, [spread]), steps), 1):
         if k == min(SMOOTH_STEPS, steps):
             n, m = (s // cut for s in x.shape)
             light = x.reshape(n, cut, m, cut).mean((1, 3)).numpy()
-            kept = float(seen(x).sum() * cut**2 / x.sum())
+            kept = float(_seen([x], [spread]).sum() * cut**2 / x.sum())
         if k % LOOK == 0 or k == steps:
-            y = seen(x)
-            y = y / y.mean()
-            nu = b + c - y
-            dual = float((nu * b).sum() - 0.5 * nu.square().sum() - b.numel() * (back(nu)[near] / reach[near]).max())
-            least = min(least, float((y - b).square().mean().sqrt()))
-            bound = max(bound, math.sqrt(max(0.0, 2.0 * dual / b.numel())))
-            if light is not None and bound > (1.0 - TIGHT) * least:
+            error, below = _error_and_bound(b, [x], c, [spread])
+            least, bound = min(least, error), max(bound, below)
+            if k >= SMOOTH_STEPS and _tight(least, bound):
                 break
-    return Deconvolved(light, pixels, least, bound, kept)
+    return Deconvolved(light, tuple(n // cut for n in spread.beside), least, bound, kept)
+
+
+def error_bound(target: np.ndarray, spreads: Sequence[Convolution], steps: int | None = None) -> float:
+    """Lower bound of the relative RMS error of any sum of irradiances, each blurred by one of these.
+
+    target, steps: as of `deconvolved`.
+    """
+    b = torch.from_numpy(target / target.mean())
+    steps = steps or _budget(b, spreads, BOUND_WORK, BOUND_STEPS)
+    least, bound = math.inf, 0.0
+    for k, (x, c) in enumerate(itertools.islice(_iterates(b, spreads, LEAST_REACH), steps), 1):
+        if k % LOOK == 0 or k == steps:
+            error, below = _error_and_bound(b, x, c, spreads)
+            least, bound = min(least, error), max(bound, below)
+            if _tight(least, bound):
+                break
+    return bound
+
+
+def _tight(error: float, bound: float) -> bool:
+    """Whether further iterations have nothing to find."""
+    return bound > (1.0 - TIGHT) * error or error < NO_ERROR
+
+
+def _budget(b: Tensor, spreads: Sequence[Convolution], work: float, least: int) -> int:
+    """Number of iterations, at least this many."""
+    return int(min(MOST_STEPS, max(least, work / sum(_cells(b, spread).numel() for spread in spreads))))
+
+
+def _iterates(b: Tensor, spreads: Sequence[Convolution], least: float = 1.0) -> Iterator[tuple[list[Tensor], float]]:
+    """x of each blur and c after each iteration for a picture b (n, m) of mean 1.
+
+    least: of the divisor w of the steps, in whose metric they are gradients: 1 leaves little light around the screen, less than 1
+    converges sooner there.
+    """
+    count = len(spreads)
+    reach = [_back(torch.ones_like(b), spread) for spread in spreads]
+    metric = [r.clamp_min(least) for r in reach]
+    x = [_cells(b, spread) / count for spread in spreads]
+    ahead, t, c = x, 1.0, 0.0
+    while True:
+        y = _seen(ahead, spreads)
+        moved = [
+            torch.where(r > REACHES, (a + _back(b + c - y, spread) / (count * w)).clamp_min(0.0), 0.0)
+            for a, spread, r, w in zip(ahead, spreads, reach, metric, strict=True)
+        ]
+        c += 0.5 * (1.0 - float(y.mean()))
+        if math.fsum(float((w * (a - m) * (m - v)).sum()) for a, m, v, w in zip(ahead, moved, x, metric, strict=True)) > 0.0:
+            t = 1.0
+        after = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * t * t))
+        ahead = [m + (t - 1.0) / after * (m - v) for m, v in zip(moved, x, strict=True)]
+        x, t = moved, after
+        yield x, c
+
+
+def _error_and_bound(b: Tensor, x: list[Tensor], c: float, spreads: Sequence[Convolution]) -> tuple[float, float]:
+    """Relative RMS error of the blurred irradiances x, and the lower bound by their nu."""
+    y = _seen(x, spreads)
+    y = y / y.mean()
+    error, nu, most = float((y - b).square().mean().sqrt()), b + c - y, -math.inf
+    nu = nu - nu.mean()
+    for spread in spreads:
+        reach = _back(torch.ones_like(b), spread)
+        near = reach > REACHES
+        most = max(most, float((_back(nu, spread)[near] / reach[near]).max()))
+    above, size = float((nu * b).sum()) - b.numel() * most, float(nu.norm())
+    return error, above / (size * math.sqrt(b.numel())) if above > 0.0 and size > 0.0 else 0.0
+
+
+def _seen(x: Sequence[Tensor], spreads: Sequence[Convolution]) -> Tensor:
+    """The image S K x, (n, m)."""
+    return torch.stack([spread(one) / spread.cut**2 for one, spread in zip(x, spreads, strict=True)]).sum(0)
+
+
+def _cells(v: Tensor, spread: Convolution) -> Tensor:
+    """An image (n, m) on the cells of the screen and around it."""
+    around = (spread.beside[1],) * 2 + (spread.beside[0],) * 2
+    return torch.nn.functional.pad(v.repeat_interleave(spread.cut, 0).repeat_interleave(spread.cut, 1), around)
+
+
+def _back(v: Tensor, spread: Convolution) -> Tensor:
+    """The adjoint of the blur, K^T S^T v, times the cells per pixel: the step of the gradient on cells."""
+    return spread.whole(_cells(v, spread), adjoint=True)

@@ -33,7 +33,7 @@ from caustic_cli.inverse.range_training import RangeAdam, RangeObjective
 from caustic_cli.inverse.robust import RobustObjective
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.schedule import Stage
-from caustic_cli.inverse.source_limits import best_irradiance, regular_rays, source_spread
+from caustic_cli.inverse.source_limits import SourceLimits, best_irradiance, performance_limits, regular_rays, source_spread
 from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.inverse.waves import WaveObjective
@@ -184,6 +184,7 @@ class Designer:
         if options.over and any(s.spread or s.source for s in stages):
             raise InputError("⟨design.over⟩ needs stages on the rays of the scene's own source, without spread")
         self._room: tuple[tuple[int, int], tuple[Tensor, Tensor]] | None = None
+        self._limits: dict[int | None, SourceLimits] = {}
         for stage in stages:
             self._bounds(stage)  # refuse an impossible lens before any work
 
@@ -191,6 +192,12 @@ class Designer:
     def scenes(self) -> list[Scene]:
         """The scene; for a network over ranges, the scenes at all combinations of their ends."""
         return [self.scene] if self.options.over is None else self.options.over.ends(self.scene)
+
+    def source_limits(self, steps: int | None = None) -> SourceLimits:
+        """The limits set by the source, which are the same for any lens: computed once; steps: as of `performance_limits`."""
+        if steps not in self._limits:
+            self._limits[steps] = performance_limits(self.scene, self.target.cpu().numpy(), steps)
+        return self._limits[steps]
 
     def field(self, stage: int) -> HeightField:
         """The spline spaces of a stage."""

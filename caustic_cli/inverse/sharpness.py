@@ -20,12 +20,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from caustic_cli.config.table import TABLE
+from caustic_cli.errors import alternatives
 from caustic_cli.inverse.deconvolution import deconvolved
 from caustic_cli.inverse.reachability import largest_magnification
-from caustic_cli.inverse.source_limits import source_spread
+from caustic_cli.inverse.source_limits import SHIFTS
+from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread
-from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.scene import PlaneWave, Scene
+from caustic_cli.scene import Disc, PlaneWave, Scene
 from caustic_cli.scene.sources.disc import SUN
 
 #: RMS error of a picture that counts as sharp, in parts of its contrast: 20 dB below it.
@@ -38,33 +40,43 @@ STEPS = 80
 MOST_PIXELS = 256
 
 
-def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float], field: HeightField, heights: torch.Tensor) -> str:
-    """Advice about the extent of the source of a finished lens: a sentence, or an empty string.
+def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float]) -> str:
+    """Advice about the extent of the source for a lens: a sentence, or an empty string.
+
+    On a tilted or curved screen, over which the image of the source varies, it is for that at its middle.
 
     Args:
-        target: (n, m) on the scene's screen; picture: its width and height, mm; heights: (n, m) mm.
+        target: (n, m) on the scene's screen; picture: its width and height, mm.
     """
     sigma = float(target.std() / target.mean()) if target.mean() > 0 else 0.0
-    if sigma == 0 or scene.source.apart or scene.screen.curved or any(scene.screen.tilt):
+    if sigma == 0:
         return ""
     if scene.source.extended:
-        spread = source_spread(scene, field, heights)
+        spread = _image(scene)
         return "" if spread is None else _of_blur(scene, target, picture, spread, SHARP * sigma)
-    if not scene.source.collimated:
+    one = _image(replace(scene, source=Disc(angle=1.0))) if scene.source.collimated else None
+    if one is None:
         return ""
-    throw, pixel = abs(scene.screen.z - scene.lens.offset.thickness), scene.screen.pixel
+    width, pixel = 2.0 * min(one.reach()), scene.screen.pixel  # of an image of one degree
     cut = max(1, min(MOST_CUT, MOST_CUT * MOST_PIXELS // max(target.shape)))  # work in proportion to the pixels of a large screen
     least = 2.0 * min(pixel) / cut  # a narrower disc is no wider than its cells
-    width = _largest_satisfying(lambda w: _blurred(target, disc(w).on(pixel, cut)) <= SHARP * sigma, least, 0.5 * min(picture))
-    if width is None:
+    angle = _largest_satisfying(
+        lambda angle: _blurred(target, scaled_spread(one, angle).on(pixel, cut)) <= SHARP * sigma,
+        least / width,
+        0.5 * min(picture) / width,
+    )
+    if angle is None:
         return ""
-    angle = math.degrees(width / throw)
     return f"the picture stays sharp (contrast reduced by a tenth) for sources of up to {angle:.2g} degrees; the sun has {SUN:g}"
 
 
-def disc(width: float) -> Spread:
-    """The image of a uniform disc of this width on the screen, mm."""
-    return Spread((0.5 * width, 0.5 * width), ((0.0, 0.0, 1.0),), 0.0)
+def _image(scene: Scene) -> Spread | None:
+    """The image of the source at the middle of the screen by light through the middle of the lens; None without one, or where it is
+    wider than the screen, or images elsewhere differ much from it, as for a source right before a lens."""
+    middle, whole = source_images(scene, middle=True), source_images(scene)
+    if not middle or not whole or max(middle[0].reach()) > max(scene.screen.size):
+        return None
+    return middle[0] if max(whole[0].reach()) > (1.0 - SHIFTS) * max(middle[0].reach()) else None
 
 
 def required_reduction(target: np.ndarray, pixel: tuple[float, float], spread: Spread, error: float) -> float | None:
@@ -98,23 +110,26 @@ def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spr
     middle, throw = lens.offset.thickness, scene.screen.z - lens.offset.thickness  # the blur is proportional to the latter
     mag, ways = picture[0] * lens.array[0] / lens.size[0], []
 
-    def reached(wanted: float, z: float) -> bool:
-        """Whether a magnification can be reached onto a screen at z."""
-        other = replace(scene, source=PlaneWave(), screen=replace(scene.screen, z=z))
-        most = largest_magnification(other, [wanted / mag * p for p in picture])
-        return most is None or most >= wanted
+    def reached(wanted: float, z: float, width: float = lens.size[0]) -> bool:
+        """Whether a magnification is accepted and can be reached by a lens of this width onto a screen at z."""
+        wider = width / lens.size[0]
+        sized = replace(lens, size=(wider * lens.size[0], wider * lens.size[1]))
+        other = replace(scene, source=PlaneWave(), lens=sized, screen=replace(scene.screen, z=z))
+        most = largest_magnification(other, [wider * wanted / mag * p for p in picture])
+        return TABLE["mag"].low <= wanted <= TABLE["mag"].high and (most is None or most >= wanted)
 
-    if reached(f * mag, scene.screen.z):
-        ways.append(f"⟨+mag⟩ {f * mag:.2g} instead of {mag:.2g}")
-    if abs(throw) / f > 2.0 * (middle - lens.z_in) and reached(mag, middle + throw / f):
-        ways.append(f"⟨+throw⟩ {abs(middle + throw / f):.3g} instead of {abs(scene.screen.z):.3g} mm")
-    ways.append(f"a lens of {f * lens.size[0]:.3g} mm")
+    higher, nearer = float(f"{f * mag:.2g}"), float(f"{middle + throw / f:.3g}")  # as they are named
+    larger = float(f"{f * lens.size[0]:.3g}")
+    if reached(higher, scene.screen.z):
+        ways.append(f"⟨+mag⟩ {higher:g} instead of {mag:.2g}")
+    if abs(throw) / f > 2.0 * (middle - lens.z_in) and reached(mag, nearer):
+        ways.append(f"⟨+throw⟩ {abs(nearer):g} instead of {abs(scene.screen.z):.3g} mm")
+    if larger * max(1.0, mag) <= TABLE["lens.size"].high and reached(mag, scene.screen.z, larger):
+        ways.append(f"a lens of {larger:g} mm")
     if not scene.source.distant:
         ways.append(f"a source {f:.2g} times smaller or farther away")
     ways.append(f"a picture whose details are {f:.2g} times as coarse")
-    return (
-        f"the source blurs this picture; it would be sharp (contrast reduced by a tenth) with {', '.join(ways[:-1])}, or {ways[-1]}"
-    )
+    return f"the source blurs this picture; it would be sharp (contrast reduced by a tenth) with {alternatives(ways)}"
 
 
 def _blurred(target: np.ndarray, spread: Convolution) -> float:

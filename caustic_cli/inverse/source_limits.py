@@ -1,5 +1,8 @@
 """Fundamental limits set by an extended source: the least error behind its blur, and the most light that etendue allows.
 
+The image of any lens is a sum of images of the source by its points (`optics.source_image`), whose weights are not negative; the
+error of every such sum is bounded from below (`deconvolution`).
+
 Etendue, the integral of cos cos / r^2 dA dA' over two areas, is conserved from the source to the screen: of light of etendue E_1
 through the lens at most the fraction E_2 / E_1 reaches a screen whose etendue with the lens is E_2.
 """
@@ -12,12 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from caustic_cli.inverse.deconvolution import FINEST, Deconvolved, deconvolved
+from caustic_cli.errors import at_most
+from caustic_cli.inverse.deconvolution import BOUND_STEPS, BOUND_WORK, FINEST, NO_ERROR, Deconvolved, deconvolved, error_bound
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.emission.coherent import modes, spots
 from caustic_cli.optics.emission.regular import RegularGrid
 from caustic_cli.optics.screen_shape import normals, points_in_space
+from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Scene, Source
@@ -31,48 +36,56 @@ EXACT, MOST_MODES = 0.04, 24
 POINTS = 12
 #: Least half width of the blur, pixels, for which the least error is computed.
 LEAST_REACH = 0.5
+#: Least half width of the blur, binned pixels, for the least error.
+BLURRED = 8.0
 #: Control points along each axis of the offset surface that stands for the lens before it is designed.
 NET = 24
 
 
 @dataclass(frozen=True)
 class SourceLimits:
-    """light: deconvolution of the picture by the source's blur; etendue: largest fraction of the light on the lens that can reach
-    the screen; each None where the source does not determine it."""
+    """error: lower bound of the relative RMS error of any lens, by the blur of the source; etendue: largest fraction of the light
+    on the lens that can reach the screen; each None where the source does not determine it."""
 
-    light: Deconvolved | None
+    error: float | None
     etendue: float | None
 
     def sentence(self) -> str:
         """The limits as a sentence for the user; empty without any."""
         found = []
-        if self.light is not None:
-            found.append(
-                f"with the blur of the source the least possible relative RMS error is between {self.light.bound:.3g} (lower bound)"
-                f" and {self.light.error:.3g} (reached)"
-            )
+        if self.error is not None:
+            found.append(f"the source blurs the picture: no lens has a relative RMS error of less than {at_most(self.error, 3)}")
         if self.etendue is not None:
             found.append(f"by etendue, at most {self.etendue:.0%} of the light on the lens can reach the screen")
         return "; ".join(found)
 
 
-def performance_limits(
-    scene: Scene,
-    target: np.ndarray,
-    field: HeightField | None = None,
-    heights: torch.Tensor | None = None,
-    steps: int | None = None,
-) -> SourceLimits:
-    """Limits for any lens under the source of a scene, from the blur of this lens, or of the offset surface without one.
+def performance_limits(scene: Scene, target: np.ndarray, steps: int | None = None) -> SourceLimits:
+    """Limits for any lens under the source of a scene.
 
-    target: (n, m) irradiance; steps: as of `best_irradiance`.
+    target: (n, m) irradiance, or (3, n, m) in colour, whose bound is the mean of its colours', as their error is; steps: as of
+    `deconvolved`.
     """
     if not scene.source.extended or scene.source.apart or scene.elements:
         return SourceLimits(None, None)
-    spread = source_spread(scene, field, heights)
-    seen = spread is not None and max(spread.reach()) > LEAST_REACH * max(scene.screen.pixel)
-    light = best_irradiance(scene, target, spread, steps) if seen else None
-    return SourceLimits(light, etendue_limit(scene))
+    images = source_images(scene)
+    seen = bool(images) and LEAST_REACH * max(scene.screen.pixel) < max(images[0].reach()) <= max(scene.screen.size)
+    errors = [_least_error(one, images, scene.screen.pixel, steps) for one in np.atleast_3d(target.T).T if one.any() and seen]
+    error = sum(errors) / len(errors) if errors else 0.0
+    return SourceLimits(error if error > NO_ERROR else None, etendue_limit(scene))
+
+
+def _least_error(target: np.ndarray, images: list[Spread], pixel: tuple[float, float], steps: int | None) -> float:
+    """Lower bound of the error of any lens with these images of its source, the sharpest first.
+
+    Where it would take too long, pixels much smaller than the blur are binned: the error of binned images is no larger than theirs.
+    """
+    (n, m), most = target.shape, max(1.0, min(r / (BLURRED * w) for r, w in zip(images[0].reach(), pixel, strict=True)))
+    sides = [k for k in range(1, min(n, m) + 1) if n % k == m % k == 0 and k <= most]
+    work = len(images) * target.size * FINEST**2 * BOUND_STEPS
+    k = next((k for k in sides if work <= BOUND_WORK * k * k), sides[-1])
+    binned = target.reshape(n // k, k, m // k, k).mean((1, 3))
+    return error_bound(binned, [image.on((pixel[0] * k, pixel[1] * k), FINEST) for image in images], steps)
 
 
 def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int | None = None) -> Deconvolved:

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.errors import InputError
+from caustic_cli.errors import InputError, at_most
 from caustic_cli.optics.gradient.fields import index_field_of
 from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.resolution import Resolution, paraxial
@@ -73,7 +73,7 @@ def check_exit_above_entrance(scene: Scene, field: HeightField, heights: Tensor)
     if dip > 0:
         raise InputError(
             f"⟨lens.z_in⟩ of {lens.z_in:g} mm lies above a part of the exit surface, which dips {dip:.3g} mm below it; it must"
-            f" be at most {lens.z_in - dip:.6g} mm"
+            f" be at most {at_most(lens.z_in - dip, 6)} mm"
         )
 
 

@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.sparse import linalg
 from torch import Tensor
 
-from caustic_cli.errors import InputError
+from caustic_cli.errors import InputError, at_least
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene.tolerances import FormError, Waviness
@@ -100,7 +100,9 @@ class FormErrors:
         counts = [math.floor(1.0 / (form.shortest * step)) for step in steps]
         if max(counts) > MOST_MODES:
             least = PERIODS * max(sizes) / MOST_MODES
-            raise InputError(f"[form_error] shortest must be at least {least:.2g} mm on this lens, got {form.shortest:g} mm")
+            raise InputError(
+                f"[form_error] shortest must be at least {at_least(least, 2)} mm on this lens, got {form.shortest:g} mm"
+            )
         fx, fy = steps[0] * np.arange(-counts[0], counts[0] + 1), steps[1] * np.arange(0, counts[1] + 1)
         f = np.hypot(fx[:, None], fy[None, :])
         inside = (f >= (1.0 - 1e-9) / longest) & (f <= (1.0 + 1e-9) / form.shortest)

@@ -48,7 +48,8 @@ class Spread:
 
     half: half axes of its ellipse, mm, 0 for point sources; shifts: images (dx, dy), mm, of the source's positions, with their
     fractions of the power; error, usual: see the module; brightness: of the source over its frame, (n, m) [i, j], None if uniform
-    over the ellipse; frame: half widths of the frame's image, mm, negative where it is mirrored.
+    over the ellipse; frame: half widths of the frame's image, mm, negative where it is mirrored; skew: of an image that is sheared
+    (a, b): a point (x, y) of the image as given by the other fields lies at (x + a y, y + b x).
     """
 
     half: tuple[float, float]
@@ -57,11 +58,12 @@ class Spread:
     usual: float = 0.0
     brightness: np.ndarray | None = None
     frame: tuple[float, float] = (0.0, 0.0)
+    skew: tuple[float, float] = (0.0, 0.0)
 
     def reach(self) -> tuple[float, float]:
         """Radius of the point-spread function along x and y, mm."""
         x, y = (max(abs(s[k]) for s in self.shifts) + self.half[k] for k in (0, 1))
-        return x, y
+        return x + abs(self.skew[0]) * y, y + abs(self.skew[1]) * x
 
     def on(self, pixel: tuple[float, float], most: int = MOST_CUT) -> Convolution:
         """The convolution on an image with these pixels, mm, which are subdivided into a divisor of `most` along each axis if too
@@ -80,6 +82,10 @@ class Spread:
         a, b = (max(kernel.shape[axis] for kernel in kernels) for axis in (0, 1))  # all are odd
         alike = [np.pad(k, [((n - m) // 2,) * 2 for n, m in zip((a, b), k.shape, strict=True)]) for k in kernels]
         return [Convolution(torch.from_numpy(kernel), cut) for kernel in alike]
+
+    def _sheared(self, x: np.ndarray, y: np.ndarray, cell: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+        """Points (x, y), mm, with the skew, in cells."""
+        return (x + self.skew[0] * y) / cell[0], (y + self.skew[1] * x) / cell[1]
 
     def kernel(self, cell: tuple[float, float], part: tuple[list[tuple[float, float]], int] | None = None) -> np.ndarray:
         """The discrete kernel on cells of this size, mm: (2 a + 1, 2 b + 1), non-negative, of sum 1.
@@ -101,13 +107,14 @@ class Spread:
             places, k = np.array(part[0]), part[1]
             mine = cKDTree(places).query(np.stack([x, y], 1))[1] == k
             x, y, light = x[mine] - places[k, 0], y[mine] - places[k, 1], light[mine] * len(places)
-        x, y = (h / w * c for h, w, c in zip(half, cell, (x, y), strict=True))
+        x, y = self._sheared(half[0] * x, half[1] * y, cell)
+        dx, dy = self._sheared(dx, dy, cell)
         # A part of the source may extend farther from its own point than the source from its centre.
         a, b = (
-            max(math.ceil(r / w), math.ceil(float(np.abs(d).max() / w + np.abs(c).max(initial=0.0)))) + 1
+            max(math.ceil(r / w), math.ceil(float(np.abs(d).max() + np.abs(c).max(initial=0.0)))) + 1
             for r, w, d, c in zip(self.reach(), cell, (dx, dy), (x, y), strict=True)
         )
-        at_x, at_y = (d[:, None] / w + c + n for d, c, w, n in ((dx, x, cell[0], a), (dy, y, cell[1], b)))
+        at_x, at_y = (d[:, None] + c + n for d, c, n in ((dx, x, a), (dy, y, b)))
         i, j = np.floor(at_x).astype(int), np.floor(at_y).astype(int)
         found = np.zeros((2 * a + 2) * (2 * b + 2))
         for p in (0, 1):

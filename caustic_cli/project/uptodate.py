@@ -133,7 +133,13 @@ def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
     if not checkpoint.results or not all(p.exists() for p in files):
         return None
     _touch(files)
-    return checkpoint.results | {"image": str(project.path / RENDER), "project": str(project.path)}
+    return checkpoint.results | made_by(project, waves)
+
+
+def made_by(project: Project, waves: bool) -> dict[str, str]:
+    """Paths of the project and its images for the figures of a design; waves: with a wave image."""
+    wave_image = {"wave_image": str(project.path / WAVE)} if waves else {}
+    return {"image": str(project.path / RENDER), **wave_image, "project": str(project.path)}
 
 
 def image_provenance(project: Project, heights: Tensor, figures: dict, asked: Mapping[str, object] | None = None) -> dict[str, str]:

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from caustic_cli.config.table import check, default
-from caustic_cli.errors import InputError
+from caustic_cli.errors import InputError, at_least
 from caustic_cli.scene.aperture import Aperture
 from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.materials import refractive_index
@@ -94,8 +94,8 @@ class Component:
         rim = self.thickness + self.sag("back") - self.sag("front")
         if rim <= 0:
             raise InputError(
-                f"⟨element.thickness⟩ of the lens at z = {self.z:g} mm must be more than {self.thickness - rim:.4g} mm for glass at"
-                f" the rim of its aperture, got {self.thickness:g} mm"
+                f"⟨element.thickness⟩ of the lens at z = {self.z:g} mm must be more than"
+                f" {at_least(self.thickness - rim, 4)} mm for glass at the rim of its aperture, got {self.thickness:g} mm"
             )
 
     def _check_mirror(self) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caustic_cli.config.table import check_all, default
-from caustic_cli.errors import InputError
+from caustic_cli.errors import InputError, at_least
 
 #: Largest number of points of a measured shape along an axis.
 MAX_SAGS = 4096
@@ -117,7 +117,7 @@ class Screen:
         bent = [(h, abs(r)) for h, r in zip(self.half_size, self.radius, strict=True) if math.isfinite(r)]
         if bent and (far := math.hypot(*(h for h, _ in bent))) > STEEPEST * bent[0][1]:
             raise InputError(
-                f"⟨screen.radius⟩ must be at least {far / STEEPEST:.4g} mm either way for a screen of {self.size[0]:g} x"
+                f"⟨screen.radius⟩ must be at least {at_least(far / STEEPEST, 4)} mm either way for a screen of {self.size[0]:g} x"
                 f" {self.size[1]:g} mm to lie on {'the sphere' if len(bent) == 2 else 'the cylinder'}, got {bent[0][1]:g} mm"
             )
 

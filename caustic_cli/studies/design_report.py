@@ -86,7 +86,7 @@ def write_report(
     if waves is None:
         title = titled("caustic", figures["relative_rms"])
         if "least_relative_rms" in figures:
-            title += f", {figures['least_relative_rms']:.3f} possible"
+            title += f", at least {figures['least_relative_rms']:.3f}"
         judged = absolute(image)
         shown = [(judged, title, "")]
     else:

@@ -463,13 +463,23 @@ def figures(found: Study) -> dict:
 
     error = found.of("relative_rms")
     adds = sum(s.adds**2 for s in found.sensitivities)
+    spread_of_error = spread("relative_rms") | {
+        "mean_square_root": float(np.sqrt(np.mean(error**2))),
+        "p95_standard_error": percentile_error(error, 0.95),
+    }
+    by = "waves" if found.by_waves else "rays"
     return {
         "draws": len(found.judged),
         "seed": found.seed,
-        "judged_by": "waves" if found.by_waves else "rays",
-        "nominal": {"relative_rms": found.nominal.relative_rms, "on_target": found.nominal.on_target},
-        "relative_rms": spread("relative_rms")
-        | {"mean_square_root": float(np.sqrt(np.mean(error**2))), "p95_standard_error": percentile_error(error, 0.95)},
+        "error": spread_of_error,
+        "error_by": by,
+        "judged_by": by,
+        "nominal": {
+            "error": found.nominal.relative_rms,
+            "relative_rms": found.nominal.relative_rms,
+            "on_target": found.nominal.on_target,
+        },
+        "relative_rms": spread_of_error,
         "shifted_relative_rms": spread("shifted"),
         "on_target": spread("on_target"),
         "noise": float(np.mean(found.of("noise"))),
@@ -496,7 +506,7 @@ def rows(f: dict) -> list[tuple[str, str]]:
     error, placed, light = f["relative_rms"], f["shifted_relative_rms"], f["on_target"]
     noise = f", noise {f['noise']:.2g}" if f["noise"] else ""
     table = [
-        ("evaluated", f"by {f['judged_by']}, {f['draws']} draws"),
+        ("evaluated", f"by {f['error_by']}, {f['draws']} draws"),
         (
             "without errors",
             f"relative RMS error {f['nominal']['relative_rms']:.4f}, light on the picture {f['nominal']['on_target']:.2%},"

@@ -23,6 +23,8 @@ from caustic_cli.studies.metrics import figures_of_merit
 FINER = 1.25
 #: Wavelengths relative to a single one, for the sensitivity to the wavelength.
 ASIDE = (0.99, 1.01)
+#: Figures of a ray image that a wave image has as well.
+_SAME = ("relative_rms", "psnr_db", "ssim", "on_target", "in_black", "on_screen")
 
 
 def wave_figures(
@@ -40,10 +42,11 @@ def wave_figures(
     exit from the heights, as of `optics.waves.wave_image`; required: take it however long that takes, or raise NoWaveImage.
 
     Returns:
-        the image, None if it is not available and `required` is false; and wave_relative_rms, wave_on_target, wave_in_black (None
-        without a target), wave_on_screen, wave_wavelengths (nm), resolvable, the number of resolvable details across the picture,
-        wave_source_points, the points that the source was taken as, wave_source_error, by how much an extended source's light is
-        misplaced so, mm, and wave_peak_irradiance and wave_mean_irradiance, as of a ray image.
+        the image, None if it is not available and `required` is false; and wave_relative_rms, wave_psnr_db, wave_ssim,
+        wave_on_target, wave_in_black (None without a target), wave_on_screen, wave_wavelengths (nm), resolvable, the number of
+        resolvable details across the picture, wave_source_points, the points that the source was taken as, wave_source_error, by
+        how much an extended source's light is misplaced so, mm, and wave_peak_irradiance and wave_mean_irradiance, as of a ray
+        image.
     """
     most = math.inf if required else UNASKED
     try:
@@ -53,10 +56,7 @@ def wave_figures(
             raise
         return None, dict.fromkeys(
             (
-                "wave_relative_rms",
-                "wave_on_target",
-                "wave_in_black",
-                "wave_on_screen",
+                *(f"wave_{name}" for name in _SAME),
                 "wave_peak_irradiance",
                 "wave_mean_irradiance",
             )
@@ -64,10 +64,7 @@ def wave_figures(
     of = _judged(found, target)
     absolute = {f"wave_{name}": value for name, value in irradiance_figures(scene, found.image).items()}
     return found, {
-        "wave_relative_rms": of["relative_rms"],
-        "wave_on_target": of["on_target"],
-        "wave_in_black": of["in_black"],
-        "wave_on_screen": of["on_screen"],
+        **{f"wave_{name}": of[name] for name in _SAME},
         "wave_wavelengths": list(found.wavelengths),
         "resolvable": seen.resolvable,
         "wave_source_points": found.points,

@@ -25,7 +25,8 @@ from caustic_cli.config import presets, settings
 from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, shape_words, without_waves
 from caustic_cli.config.default_stages import transport_cells
 from caustic_cli.config.settings import Settings, value_of
-from caustic_cli.errors import CausticError, InputError, Interrupted
+from caustic_cli.config.table import TABLE
+from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, InitialHeights, State
@@ -35,7 +36,7 @@ from caustic_cli.inverse.lenslets import initial_array
 from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.sharpness import advice
-from caustic_cli.inverse.source_limits import best_irradiance, performance_limits, point_source, source_spread
+from caustic_cli.inverse.source_limits import best_irradiance, point_source, source_spread
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
@@ -49,7 +50,7 @@ from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.packing import expected_bytes, rounded
-from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
+from caustic_cli.project.project import CHECKPOINT, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview, wall_and_stock
 from caustic_cli.workflow.compilation import announce_compilation, compile_usual
@@ -193,7 +194,8 @@ def begin(
             project, first = first_heights(project, said)
         except OutOfReach as error:
             most = largest_magnification(designer.scene, project.settings["target"]["size"])
-            within = f"; ⟨+mag⟩ of at most about {most:.2g} is within reach at this throw" if most else ""
+            most = min(most or 0.0, TABLE["mag"].high)
+            within = f"; ⟨+mag⟩ of at most about {at_most(most, 2)} is within reach at this throw" if most else ""
             raise InputError(f"{error}{within}") from error
     if out is not None:
         directory.create(project, force)
@@ -294,7 +296,7 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     if not designer.scene.elements:
         say.say(seen.sentence())
     timed = math.isfinite(project.settings["design"]["time_limit"])
-    words = performance_limits(designer.scene, grey(target), steps=SMOOTH_STEPS if timed else None).sentence()
+    words = designer.source_limits(SMOOTH_STEPS if timed else None).sentence()
     if words:
         say.say(words)
     if designer.scene.joint:
@@ -563,7 +565,7 @@ def _run(
             found.figures | made | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
         )
         if project.path is not None:
-            figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
+            figures |= uptodate.made_by(project, figures.get("wave_relative_rms") is not None)
         records.keep(found.state, figures)
         if movie is not None:
             movie.finish(found.image if found.waves is None else found.waves, found.figures)
@@ -575,7 +577,7 @@ def _run(
     field = designer.field(found.state.stage)
     scene, heights = split_heights(designer.scene, field, found.state.heights)
     size = tuple(project.settings["target"]["size"])
-    if not timed and scene.second is None and (words := advice(scene, grey(target), size, field, heights)):
+    if not timed and scene.second is None and (words := advice(scene, grey(target), size)):
         say.say(words)
     return Result(project, scene, field, heights, target, found.state, figures)
 
@@ -590,7 +592,7 @@ def _run_index(project: Project, say: Reporter, began: float, device: str) -> Re
         figures = judged.figures | index_figures(project)
         figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "reason": state.reason}
         if project.path is not None:
-            figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
+            figures |= uptodate.made_by(project, figures.get("wave_relative_rms") is not None)
         _Records(project, designer, device).keep(state, figures)
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is complete", 128 + asked[0])

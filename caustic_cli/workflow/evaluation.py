@@ -15,7 +15,6 @@ import torch
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.loss_terms import parse
-from caustic_cli.inverse.source_limits import performance_limits
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import discard
 from caustic_cli.io.picture import WIDE, write_image
@@ -28,6 +27,7 @@ from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.design_report import write_report
 from caustic_cli.studies.irradiance import irradiance
+from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import FINAL_RAYS, RELATIVE_NOISE, evaluation_rays, retrace, white_level
 from caustic_cli.studies.second_target import second_figures
 from caustic_cli.studies.waves import unseen_figures, wave_figures
@@ -54,7 +54,8 @@ BRIGHTER = 1.01
 class Evaluation:
     """Result of the evaluation of a design.
 
-    state: with the lens that was kept; figures: of the JSON table, with start_relative_rms if the initial surface was retraced;
+    state: with the lens that was kept; figures: of the JSON table, with start_error, its judged error, and start_relative_rms if
+    the initial surface was retraced;
     image, waves: power per pixel on the screen, ray image and wave image (None if that was not refined), (n_x, n_y) or
     (3, n_x, n_y), float64; second: that on a second screen, or None.
     """
@@ -193,16 +194,17 @@ def evaluate(
             of_start, more = as_waves(start)
             began |= more
         if _worse(figures, began):
-            state = replace(designer.showing(state, start), reason=f"{state.reason}; its start was better and is kept")
-            exposure, judged = trace(start)
-            figures, light = began | judged, of_start
+            why = f"its start was better and is kept: {_difference(figures, began)}"
+            state = replace(designer.showing(state, start), reason=f"{state.reason}; {why}")
+            exposure, retraced = trace(start)
+            figures, light = began | retraced, of_start
         elif began["on_screen"] > 0:
             likeness, light_of = _keys(figures, began)
             if figures[likeness] > began[likeness]:
                 brighter = figures[light_of] / began[light_of] - 1.0
-                why = f"its start was more like the picture; this lens is {brighter:.1%} brighter"
+                why = f"its start was more like the picture, this lens is {brighter:.1%} brighter: {_difference(figures, began)}"
                 state = replace(state, reason=f"{state.reason}; {why}")
-        figures = figures | {"start_relative_rms": began["relative_rms"]}
+        figures = figures | {"start_error": judged(began, refined)["error"], "start_relative_rms": began["relative_rms"]}
         if began["noise"] is not None:
             figures |= {"start_noise": began["noise"]}
         if refined:
@@ -211,15 +213,16 @@ def evaluate(
         rounded = began or trace(designer.within_limits(replace(state, heights=designer.begun(state))))[1]
         unrounded = trace(designer.begun(state, rounded=False))[1]
         figures |= {"min_radius": radius_figures(designer.options.min_radius, rounded, unrounded)}
-    bounds = performance_limits(scene, grey(target), field, state.heights, SMOOTH_STEPS if timed else None)
-    if bounds.light is not None:
-        figures |= {"least_relative_rms": bounds.light.error}
+    bounds = designer.source_limits(SMOOTH_STEPS if timed else None)
+    if bounds.error is not None:
+        figures |= {"least_relative_rms": bounds.error}
     if bounds.etendue is not None:
         figures |= {"etendue_limit": bounds.etendue}
     if light is not None:
         figures |= unseen_figures(scene, field, state.heights.to(device), target)
     if designer.options.over is not None:
         figures |= {"over": range_evaluation.errors(designer, state, target, rays=FINAL_RAYS // OVER, seed=seed, device=device)}
+    figures = judged(figures, refined)
     return Evaluation(state, figures, exposure.image.cpu().numpy(), None if light is None else light.image.cpu().numpy())
 
 
@@ -236,11 +239,12 @@ def _both_sides(designer: Designer, target: np.ndarray, state: State, device: st
     image, second, figures = trace(state.heights)
     if state.start is not None:
         began = trace(designer.begun(state), FINAL_RAYS // STARTS)[2]
+        figures |= {"start_error": began["relative_rms"]}
         figures |= {f"start_{key}": began[key] for key in ("relative_rms", "second_relative_rms", "angle_rms_mrad") if key in began}
         if state.unrounded is not None:
             unrounded = trace(designer.begun(state, rounded=False), FINAL_RAYS // STARTS)[2]
             figures |= {"min_radius": radius_figures(designer.options.min_radius, began, unrounded)}
-    return Evaluation(state, figures, image, None, second)
+    return Evaluation(state, judged(figures, False), image, None, second)
 
 
 def radius_figures(radius: float, rounded: dict, unrounded: dict) -> dict[str, float | None]:
@@ -269,6 +273,16 @@ def _keys(figures: dict, than: dict) -> tuple[str, str]:
     """Names of the figures by which two lenses are compared, error and light: those of the wave image if both have one."""
     as_waves = None not in (f.get("wave_relative_rms") for f in (figures, than))
     return ("wave_relative_rms", "wave_on_screen") if as_waves else ("relative_rms", "on_screen")
+
+
+def _difference(figures: dict, start: dict) -> str:
+    """By which figures a lens and its initial surface differ, as a clause."""
+    likeness, light = _keys(figures, start)
+    by = "waves" if likeness.startswith("wave") else "rays"
+    return (
+        f"relative RMS error by {by} {start[likeness]:.4f}, after the iterations {figures[likeness]:.4f},"
+        f" with {start[light]:.2%} and {figures[light]:.2%} of the light on the screen"
+    )
 
 
 def _worse(figures: dict, than: dict) -> bool:

@@ -28,6 +28,7 @@ from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
+from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import FINAL_RAYS, RELATIVE_NOISE, evaluation_rays, retrace
 from caustic_cli.studies.waves import height_deviation, wave_figures
 from caustic_cli.workflow.compilation import compile_for
@@ -126,6 +127,13 @@ class Lens:
         return 0 if self.project is None else self.project.settings["design"]["seed"]
 
     @property
+    def by_waves(self) -> bool:
+        """Whether its design was refined on its wave image, which then judges it."""
+        if self.project is None or self.state is None:
+            return False
+        return any(stage.get("waves") for stage in self.project.settings["design"]["stages"][: self.state.stage + 1])
+
+    @property
     def encoding(self) -> str:
         """Encoding of its picture, and of its images."""
         return "srgb" if self.project is None else self.project.settings["target"]["encoding"]
@@ -188,7 +196,7 @@ class Lens:
             dtype=dtype,
             requests=plan.requests,
         )
-        return Render(exposure.image.cpu().numpy(), figures)
+        return Render(exposure.image.cpu().numpy(), judged(figures, False))
 
     def render_waves(
         self, *, effects: str | Plan = "auto", required: bool = True, device: str = "cpu", cut: CutSurface | None = None
@@ -210,7 +218,7 @@ class Lens:
             required=required,
             perturbation=None if cut is None else height_deviation(cut, self.field, self.heights),
         )
-        return Render(np.empty((0, 0)) if light is None else light.image.cpu().numpy(), figures)
+        return Render(np.empty((0, 0)) if light is None else light.image.cpu().numpy(), judged(figures, True))
 
     def _resolution(self, scene: Scene) -> Resolution:
         """Resolution of the scene by diffraction."""
@@ -240,8 +248,7 @@ class Lens:
         path = Path(path)
         name = format_of(path, format)
         given: dict[str, Any] = {key: value for key, value in (("samples", samples), ("tolerance", tolerance)) if value is not None}
-        waves = self.figures.get("wave_relative_rms") is not None
-        exporter = Exporter(self.scene, self.field, self.heights, self.target, waves, self.seed)
+        exporter = Exporter(self.scene, self.field, self.heights, self.target, self.by_waves, self.seed)
         exporter.write(path, name, script, mould, block, milling, **given)
         return path
 

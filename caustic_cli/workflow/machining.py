@@ -91,13 +91,9 @@ def form_deviation(cut: CutSurface, field: HeightField, heights: Tensor, round: 
 def rows(figures: dict) -> list[tuple[str, str]]:
     """The figures as rows of a table (name, text), with the error of the design for comparison."""
     f, nominal = figures["cut"], []
-    if f.get("nominal_relative_rms") is not None:
-        nominal = [
-            (
-                "relative RMS error, by rays",
-                f"{figures['relative_rms']:.4f}; of the surface as designed {f['nominal_relative_rms']:.4f}",
-            )
-        ]
+    if f["nominal_error_by"] is not None:
+        designed = f"of the surface as designed {f['nominal_error']:.4f} by {f['nominal_error_by']}"
+        nominal = [("relative RMS error", f"{figures['error']:.4f} by {figures['error_by']}; {designed}")]
     return [
         *nominal,
         ("left on the surface", f"up to {1e3 * f['cut_left_mm']:.3g} µm, RMS {1e3 * f['cut_rms_mm']:.3g} µm"),

@@ -77,10 +77,9 @@ class Movie:
 
     def finish(self, image: np.ndarray, figures: dict[str, Any]) -> None:
         """Record the image of the finished lens with the figures of its evaluation, as the last frame."""
-        waves = figures.get("wave_relative_rms")
-        error = figures["relative_rms"] if waves is None else waves
-        how = f"{figures['rays']:,} independent rays" if waves is None else "independent wave image"
-        self._add(image, f"finished after {self._last}" if self._last else "finished", f"relative RMS error {error:.3f}, {how}")
+        how = "independent wave image" if figures["error_by"] == "waves" else f"{figures['rays']:,} independent rays"
+        words = f"relative RMS error {figures['error']:.3f}, {how}"
+        self._add(image, f"finished after {self._last}" if self._last else "finished", words)
 
     def write(self) -> None:
         """Write the file atomically; none if nothing was recorded."""

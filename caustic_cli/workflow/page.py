@@ -88,15 +88,16 @@ def _light_rows(scene: Scene) -> list[tuple[str, str]]:
 
 def _figure_rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Figures of the render."""
-    rms, noise, waves = (figures.get(key) for key in ("relative_rms", "noise", "wave_relative_rms"))
+    rms, noise, waves, by = (figures.get(key) for key in ("relative_rms", "noise", "wave_relative_rms", "error_by"))
     rows = [("Rendered", f"{figures['rays']:,} rays; {figures['on_screen']:.2%} of the light on the screen")]
     if figures.get("of_source") is not None:
         rows.append(
             ("On the picture", f"{100.0 * figures['of_source']:.3g}% of all that the source emits {figures['source_emits']}")
         )
-    if rms is not None:
-        rows.append(("Relative RMS error", f"{rms:.4f}" + ("" if noise is None else f" ± {noise:.2g}") + ", by rays"))
-    return rows if waves is None else [*rows, ("Error as a wave", f"{waves:.4f}, of what light will do")]
+    errors = [] if rms is None else [("rays", f"{rms:.4f}" + ("" if noise is None else f" ± {noise:.2g}"))]
+    errors += [] if waves is None else [("waves", f"{waves:.4f}")]
+    errors.sort(key=lambda one: one[0] != by)  # the judged one first
+    return rows + [(f"{'Error' if k else 'Relative RMS error'} by {name}", value) for k, (name, value) in enumerate(errors)]
 
 
 def _notes(plan: Plan) -> list[str]:

@@ -28,6 +28,7 @@ from caustic_cli.scene import Scene
 from caustic_cli.studies import effects as effects_study
 from caustic_cli.studies import manufacture
 from caustic_cli.studies.irradiance import irradiance
+from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import FINAL_RAYS, white_level
 from caustic_cli.studies.second_target import second_figures
 from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
@@ -139,8 +140,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     """Trace a lens and write its irradiance image.
 
     Returns:
-        the figures of the JSON table; `effects`, `report` and `verify` if requested; `reused` if they were up to date and nothing
-        was done.
+        the figures of the JSON table; `effects`, `report` and `verify` if requested; those of the earlier run if all is up to date.
 
     Raises:
         InputError: there is no lens, a value is out of range, or a file exists already; nothing was written.
@@ -180,7 +180,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         say.say(
             f"{image_path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it"
         )
-        return figures | {"reused": True}
+        return figures
     lens = archived or Lens.of(cast(Project, project), asked.given)
     if asked.screen_at is not None:
         lens = replace(lens, scene=replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at)))
@@ -212,10 +212,6 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         say=say,
         cut=cut,
     )
-    if cut is not None:
-        nominal = lens.render(rays, seed=seed, effects=plan, dtype=asked.dtype, device=device, say=say).figures
-        beside_it = {f"nominal_{name}": nominal[name] for name in ("relative_rms", "noise")}
-        figures["cut"] = {"program": str(asked.cut)} | beside_it | deviation
     shown = irradiance(image, scene.screen)
     aim = None if lens.target is None else irradiance(lens.target, scene.screen)
     wide = WIDE if asked.image is None else 1
@@ -255,6 +251,13 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         with say.notify_if_slow("computing the wave image"):
             waves, more = _wave_image(plan, lens, device, asked.effects != "auto", wave_path, wave_npy, cut, wide)
         figures |= more
+    figures = judged(figures, lens.by_waves or "diffraction" in (parse_effects(asked.effects) or ()))
+    if cut is not None:
+        nominal = lens.render(rays, seed=seed, effects=plan, dtype=asked.dtype, device=device, say=say).figures
+        if figures["error_by"] == "waves":
+            nominal |= lens.render_waves(effects=plan, required=False, device=device).figures
+        beside_it = {f"nominal_{name}": nominal[name] for name in ("error", "error_by", "relative_rms", "noise")}
+        figures["cut"] = {"program": str(asked.cut)} | beside_it | deviation
     if asked.html is not None:
         page.write(asked.html, lens, plan, figures, waves, asked.lens.resolve().stem)
         figures["page"] = str(asked.html)

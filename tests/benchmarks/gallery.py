@@ -92,13 +92,17 @@ def row(name: str, picture: Path, quality: str, folder: Path, out: Path) -> str:
     seconds = time.monotonic() - began
     sharp = caustic("render", project, "--rays", "3.2e7" if said.get("least_relative_rms") is None else "8e6")
     strip(project, out / f"{name}.png")
+    errors = {"rays": f"by rays {sharp['relative_rms']:.3f} ± {sharp['noise']:.4f}"}
+    if sharp.get("wave_relative_rms") is not None:
+        errors["waves"] = f"of the wave image {sharp['wave_relative_rms']:.3f}"
+    judged = errors.pop(sharp["error_by"])
     figures = [
-        f"relative RMS error by rays {sharp['relative_rms']:.3f} ± {sharp['noise']:.4f}",
-        f"of the wave image {sharp['wave_relative_rms']:.3f}" if sharp.get("wave_relative_rms") is not None else "",
-        f"least possible error behind the source's blur {said['least_relative_rms']:.3f}" if said.get("least_relative_rms") else "",
-        f"light on the picture {sharp['on_target']:.1%}"
+        f"relative RMS error {judged}",
+        f"at least {said['least_relative_rms']:.3f} for any lens, by the source's blur" if said.get("least_relative_rms") else "",
+        f"light on the picture {sharp['wave_on_target' if sharp['error_by'] == 'waves' else 'on_target']:.1%}"
         + (f", {100.0 * sharp['of_source']:.3g}% of all the source emits" if sharp["of_source"] != sharp["on_target"] else ""),
         f"designed in {seconds:.0f} s",
+        *errors.values(),
     ]
     command = f"caustic design {picture.name} {options}".strip() + (f" --quality {quality}" if quality != "standard" else "")
     return f"## {words}\n\n![{words}]({name}.png)\n\n{'; '.join(filter(None, figures))}.\n\n```sh\n{command}\n```\n"

@@ -55,7 +55,7 @@ def run(arguments, capfd, code):
     """The error line of a command that ends with `code`."""
     assert cli.run([str(a) for a in arguments]) == code
     out, err = capfd.readouterr()
-    assert out == "" and (code == 0 or (err.startswith("caustic: ") and err.count("\n") == 1)), err
+    assert (out != "") == (code == 0) and (code == 0 or (err.startswith("caustic: ") and err.count("\n") == 1)), err
     return err
 
 

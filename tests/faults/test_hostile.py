@@ -326,7 +326,9 @@ def test_project_toml(copy, capfd):
         )
         codes.append(cli.run([*command, "--quiet"]))
         out, err = capfd.readouterr()
-        assert codes[-1] in (0, 2) and out == "" and err.count("\n") == (codes[-1] == 2) and "\x1b" not in err, err
+        assert (
+            codes[-1] in (0, 2) and (out != "") == (codes[-1] == 0) and err.count("\n") == (codes[-1] == 2) and "\x1b" not in err
+        ), err
 
     check()
     assert {0, 2} <= set(codes)
