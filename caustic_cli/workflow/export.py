@@ -285,6 +285,10 @@ def exporter_of(project: Path, at: str | None, say: Reporter, most: float = MOST
     return Exporter(scene, field, heights, target, waves, opened.settings["design"]["seed"], most, say), opened
 
 
+#: How to have formats of splines exactly.
+EXACT = {"step": "⟨tolerance⟩ 0 writes the exact one", "lighttools": "⟨tolerance⟩ 0 stores exact numbers"}
+
+
 def accuracy_words(figures: dict) -> str:
     """The picture through the exported file, as a phrase."""
     if "read_as" not in figures:
@@ -303,7 +307,11 @@ def accuracy_words(figures: dict) -> str:
     ]
     if figures["height_error_mm"] > 0:
         others.append(f"heights are at most {_length(figures['height_error_mm'])} off")
-    text = "; ".join([f"{nx} x {ny} points, read as {figures['read_as']}: {judged}", *others])
+    exact = figures["height_error_mm"] == 0.0 and "B-spline" in figures["read_as"]
+    read = "the spline itself" if exact else f"{nx} x {ny} points, read as {figures['read_as']}"
+    if not exact and figures.get("format") in EXACT:
+        others.append(EXACT[figures["format"]])
+    text = "; ".join([f"{read}: {judged}", *others])
     if figures["keeps_picture"]:
         return text
     kept = f"⟨format⟩ {alternatives(figures['keep_it'])} keeps it" if figures["keep_it"] else "no format keeps it in 100 MB"

@@ -558,19 +558,19 @@ def test_the_standard_output_is_not_replaced(link, here):
 
 def test_an_output_is_written_where_its_link_leads(here):
     Path("folder").mkdir()
-    Path("link.nc").symlink_to("folder/lens.nc")
-    order = ["export", "a.caustic", "--format", "gcode", "--scallop", "0.1", "-o", "link.nc"]
-    Path("folder/lens.nc").write_text("mine")
+    Path("link.png").symlink_to("folder/lens.png")
+    order = ["render", "a.caustic", "--rays", "400", "-o", "link.png"]
+    Path("folder/lens.png").write_text("mine")
     assert "was not made by caustic" in refused_command(*order)
     assert bounded(lambda: command(*order, "--force"), 60).startswith("0")
-    assert files.is_ours("folder/lens.nc") and os.readlink("link.nc") == "folder/lens.nc"
-    Path("link.nc").unlink()
-    Path("link.nc").symlink_to("a.caustic/checkpoints.h5")
+    assert files.is_ours("folder/lens.png") and os.readlink("link.png") == "folder/lens.png"
+    Path("link.png").unlink()
+    Path("link.png").symlink_to("a.caustic/checkpoints.h5")
     assert "part of the project" in refused_command(*order, "--force")
-    Path("link.nc").unlink()
-    Path("link.nc").symlink_to("nowhere")
+    Path("link.png").unlink()
+    Path("link.png").symlink_to("nowhere")
     assert bounded(lambda: command(*order, "--force"), 60).startswith("0")
-    assert files.is_ours("link.nc") and not Path("link.nc").is_symlink() and not Path("nowhere").exists()
+    assert files.is_ours("link.png") and not Path("link.png").is_symlink() and not Path("nowhere").exists()
 
 
 def test_a_new_design_spares_what_a_link_of_the_old_one_leads_to(here):
