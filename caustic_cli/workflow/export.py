@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -150,13 +151,13 @@ class Exporter:
     def figures(self, file: File, choice: dict, format: str) -> dict:
         """Figures of a file for JSON: error of the picture as read from it; lens_error, of the lens itself; error_by and noise;
         errors of other readings (facet_error, cloud_error); keeps_picture; read_as, samples, height_error_mm; and keep_it, the
-        formats that keep a picture that this file does not."""
+        formats that keep a picture that this file does not.  An error is None where the reading has no wave image."""
         readings = file.readings(choice)
         errors = {key: self.error(file, choice, key) for key in readings}
         kept = errors["error"] <= self.picture.largest
         own = readings["error"]()
         found = {
-            **errors,
+            **{key: value if math.isfinite(value) else None for key, value in errors.items()},
             "error_by": self.picture.by,
             "lens_error": self.picture.own if self.picture.known else None,
             "noise": self.picture.noise,
@@ -299,9 +300,9 @@ def accuracy_words(figures: dict) -> str:
     if figures["lens_error"] is None:
         judged = f"its image differs from the lens' own by {figures['error']:.2g} (relative RMS, by rays)"
     else:
-        judged = f"relative RMS error {figures['error']:.4f} {by}, where the lens itself has {figures['lens_error']:.4f}"
+        judged = f"relative RMS error {_error(figures['error'])} {by}, where the lens itself has {figures['lens_error']:.4f}"
     others = [
-        f"{name} {figures[key]:.4f}"
+        f"{name} {_error(figures[key])}"
         for key, name in (("facet_error", "its flat facets have"), ("cloud_error", "its points, read as a bicubic spline, have"))
         if key in figures
     ]
@@ -320,6 +321,10 @@ def accuracy_words(figures: dict) -> str:
 
 def _arguments(format: str, part: Part) -> tuple:
     return (part,) if format in AS_CUT else (part.scene, part.field, part.heights)
+
+
+def _error(error: float | None) -> str:
+    return "unknown, as there is no wave image," if error is None else f"{error:.4f}"
 
 
 def _length(length: float) -> str:
