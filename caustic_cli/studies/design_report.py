@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
@@ -315,7 +316,8 @@ def _balance_words(figures: dict) -> str:
     judged by, and what a least radius adds to that."""
     waves, radius = figures.get("wave_relative_rms") is not None, figures.get("min_radius")
     words, black = ("where the light goes, by rays", "wave_in_black") if waves else ("where the light goes", "in_black")
-    if figures.get("of_source") is not None and figures["of_source"] != figures["on_target"]:
+    seen = figures["wave_on_target"] if figures.get("error_by") == "waves" else figures["on_target"]
+    if figures.get("of_source") is not None and not math.isclose(figures["of_source"], seen):  # it emits beside the lens, too
         words += f"\non the picture {100.0 * figures['of_source']:.3g} % of all that the source emits"
     if figures.get(black) is not None:
         words += f"\nof that on the screen, in black {figures[black]:.2%}{', by waves' if waves else ''}"
