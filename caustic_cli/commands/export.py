@@ -133,7 +133,7 @@ def run(
         given = {
             key: v for key, v in given_of.items() if v is not None and name in options_of.get(f"--{key}", (True, ("gcode",)))[1]
         }
-        figures, _ = export(exporter, opened, name, output, script and name == "lighttools", given, force, at)
+        figures = export(exporter, opened, name, output, script and name == "lighttools", given, force, at)
         all_figures.append(figures)
         words = accuracy_words(figures)
         say.result(f"{figures['file']}: {figures['bytes']:,} bytes{f', {words}' if words else ''}")

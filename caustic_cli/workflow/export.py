@@ -234,7 +234,7 @@ def export(
     given: dict,
     force: bool,
     at: str | None = None,
-) -> tuple[dict, bool]:
+) -> dict:
     """Export the lens of a project.
 
     Args:
@@ -246,7 +246,7 @@ def export(
         at: parameter values for a network that was trained over ranges, "throw=300"; also part of the default file name.
 
     Returns:
-        figures file, format, bytes, seconds, and beside, the companion files; and whether all of it was up to date already.
+        figures file, format, bytes, seconds, and beside, the companion files; those of an earlier run where all is up to date.
 
     Raises:
         InputError: there is no lens, the format does not support it, or a file exists already; nothing was written.
@@ -261,7 +261,7 @@ def export(
         exporter.say.say(
             f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it"
         )
-        return found, True
+        return found
     made.refuse_foreign(force)
     found = exporter.write(path, format, script, **given)
     more = {"beside": [str(file) for file in written[1:]]} if len(written) > 1 else {}
@@ -273,7 +273,7 @@ def export(
         "seconds": time.monotonic() - began,
     } | found
     made.keep(figures)
-    return figures, False
+    return figures
 
 
 def exporter_of(project: Path, at: str | None, say: Reporter, most: float = MOST_BYTES) -> tuple[Exporter, Project]:
