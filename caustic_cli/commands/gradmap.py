@@ -63,7 +63,7 @@ def run(
     options.require_project(project)
     device = options.start_torch(device, threads, say)
 
-    from caustic_cli.config.completion import filter_from  # noqa: PLC0415
+    from caustic_cli.config.design import filter_from  # noqa: PLC0415
     from caustic_cli.io.files import destination, refuse_foreign  # noqa: PLC0415
     from caustic_cli.io.picture import write_npy  # noqa: PLC0415
     from caustic_cli.project.project import Project  # noqa: PLC0415

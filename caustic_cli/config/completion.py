@@ -12,72 +12,35 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
-from caustic_cli.config.default_stages import (
-    GAPS,
-    LEAST_SPANS,
-    LEAST_WAVES,
-    RAYS_PER_PIXEL,
-    Table,
-    coarse_to_fine,
-    completed_stage,
-    creased_control,
-    each_lenslet,
-    on_rays,
-    on_waves,
-    refinement,
-    refinement_spans,
-    stage_base,
-    two_sided,
-    usual_sampler,
-    wave_refinement,
-)
+from caustic_cli.config.design import relative_to_initial
 from caustic_cli.config.optional import (
     centre_screen,
     complete_blank,
     complete_elements,
-    complete_index_design,
     complete_over,
     complete_second,
     complete_second_size,
-    complete_two_sided,
     default_magnification,
 )
 from caustic_cli.config.settings import (
     DEFAULTS,
     Settings,
-    build_lens,
-    build_light,
     build_screen,
     build_source,
-    elements_of,
     index_of,
     value_of,
     with_defaults,
 )
 from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.designer import Options
-from caustic_cli.inverse.lenslets import NEEDS_DISTANT_SOURCE
-from caustic_cli.inverse.parametrisation import Architecture
 from caustic_cli.inverse.scene_parameters import Ranges
-from caustic_cli.inverse.schedule import Stage
-from caustic_cli.inverse.source_limits import source_spread
-from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.resolution import BAND, Resolution, white
-from caustic_cli.scene import Offset, Scene, Screen, Source, sources
-from caustic_cli.scene.lens import array_control
+from caustic_cli.kinds import complete_design
+from caustic_cli.kinds.defaults import Defaults
+from caustic_cli.scene import Offset, Source, sources
 from caustic_cli.scene.light import RGB
-from caustic_cli.scene.sources.section import content
-from caustic_cli.scene.tolerances import Tolerances
 
 DEFAULT_RESOLUTION = 250
-DEFAULT_SPANS = 128  # knot spans of the final net; divisible by 2 through the stages
-NETWORK_CONTROL = 50  # table D.2
-OVER_ITERATIONS = 200  # for a network over a range: caustic convergence, study design, networks
-DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and above which another quality uses the time better
-EXTENDED = 5.0  # factor of these limits for an extended source, whose start includes a deconvolution
 STEEPEST = 1.25  # least radius of a derived sphere in half diagonals of the lens: slopes up to 1.3
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a thin plate, and its least wall thickness, mm
 THICK, SAG = 2.0, 0.45  # thickness over width of a lens with two free-form sides, and largest height of a side over thickness
@@ -165,7 +128,7 @@ def complete(
     complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
     if over:
         complete_over(over, s, given)
-    if (over or _relative_to_initial(s["design"])) and "initial" not in given.get("design", {}):
+    if (over or relative_to_initial(s["design"])) and "initial" not in given.get("design", {}):
         s["design"]["initial"] = "zero-last"
     complete_second(s)
     if "size" not in target or mag is not None:
@@ -184,7 +147,7 @@ def complete(
     build_screen(s)
     source = build_source(s)
     _complete_lens(lens, screen, target, source, sides=2 if "second" in s else 1)
-    _complete_design(s, source, by.quality, by.rays, lit, gaps)
+    complete_design(s, Defaults(s, source, by.quality, by.rays, lit, gaps))
     return s
 
 
@@ -272,290 +235,4 @@ def shape_words(s: Settings) -> str:
     return (
         f"the picture is magnified {w / a:.3g} times along x and {h / b:.3g} times along y; a lens of its own shape needs less"
         f" depth: ⟨+lens.size⟩ {width:.3g}x{width * h / w:.3g}"
-    )
-
-
-def _complete_design(
-    s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float], gaps: float
-) -> None:
-    lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
-    degree = check("lens.degree", lens["degree"])
-    if "stages" in design and (given or rays):
-        raise InputError(
-            "⟨quality⟩ and ⟨rays⟩ shape the default stages, but the configuration brings [[design.stages]]"
-            " of its own: change them there"
-        )
-    if lens.get("gradient") == "free":
-        complete_index_design(s, source, quality or _quality(design["time_limit"], source), rays)
-        return
-    plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
-    asked = check("design.waves", design["waves"])
-    array = value_of(lens, "lens.array")
-    fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
-    fine_net = fine_net or max(array) > 1  # lenslets need a transport start
-    spread = plain and fine_net and not source.sharp and not elements_of(s) and _shifts(s, source)
-    shaped = (plain or _relative_to_initial(design)) and fine_net and not source.apart
-    design.setdefault("start", "transport" if "second" in s or shaped else "offset")
-    if design["start"] != "offset" and design["network"] != "none" and not _relative_to_initial(design):
-        raise InputError(
-            f"⟨design.start⟩ {design['start']} gives a surface, from which a network can start only with"
-            " ⟨+design.preconditioner⟩ laplacian; use that, start offset, or network none"
-        )
-    if max(array) > 1 and (design["start"] == "offset" or not plain):
-        raise InputError(
-            "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none and"
-            " optimizer lbfgs"
-        )
-    if max(array) > 1 and design["start"] == "transport" and not source.distant:
-        raise InputError(NEEDS_DISTANT_SOURCE)
-    quality = quality or _quality(design["time_limit"], source)
-    if "second" in s:
-        complete_two_sided(s, source, quality, rays)
-        return
-    if any(table.get("free", "none") != "none" for table in elements_of(s)) and design["start"] != "transport":
-        raise InputError(
-            f"⟨design.start⟩ of several free surfaces must be transport, got {design['start']}; a small net or several points"
-            " have no such start"
-        )
-    # A transport start is accurate at every scale for a point source or plane wave, if the net resolves it, and for an extended
-    # source that shifts the image, apart from its blur; otherwise the stages are coarse to fine.
-    moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread or max(array) > 1)
-    own = "control" in lens
-    if not own:
-        spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
-        of_network = [DEFAULT_SPANS + p for p in degree] if value_of(design, "design.over") else [NETWORK_CONTROL] * 2
-        lens["control"] = [spans + p for p in degree] if design["network"] == "none" else of_network
-        lens["control"] = _of_array(lens["control"], degree, array)
-    elif (fits := _of_array(lens["control"], degree, array)) != list(lens["control"]):
-        raise InputError(
-            "⟨lens.control⟩ of an array must be lenslets times (spans + degree - 1) and one more along each axis, such as"
-            f" {fits[0]} x {fits[1]}, got {lens['control'][0]} x {lens['control'][1]}"
-        )
-    design.setdefault("preconditioner", "laplacian" if plain else "none")
-    if "stages" in design:
-        design["stages"] = [completed_stage(stage, s, usual_sampler(source)) for stage in design["stages"]]
-        if asked != "auto" and any(stage.get("waves") for stage in design["stages"]) != (asked == "on"):
-            raise InputError(
-                f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
-                + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves")
-            )
-        return
-    nx, ny = screen["resolution"]
-    sampler, base = usual_sampler(source), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
-    waves = _wave_stages(s, source, quality, lit)
-    if moved and elements_of(s):
-        stages = two_sided(tuple(lens["control"]), rays, (nx, ny), quality)
-    elif moved:
-        centre = source.pointlike() if spread else source
-        # Diffraction smooths creases more than a coarser net, and the pixels of a tilted screen do not coincide with those that the
-        # map is solved for, which shows as lines: a flame at 30 degrees has an error of 0.205 on the finer net and 0.087 without.
-        aligned = source.distant and build_screen(s).upright
-        creased = gaps >= GAPS and not (own or waves or spread) and aligned and max(array) == 1
-        if creased:
-            lens["control"] = [creased_control(max(nx, ny), p, quality) for p in degree]
-        stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, not centre.collimated, spread, creased)
-        if value_of(s["target"], "target.sheet"):
-            stages = each_lenslet(stages, math.prod(array), (nx, ny))
-    elif value_of(design, "design.over"):
-        last = refinement(tuple(lens["control"]), rays or base, (nx, ny), quality)[-1]
-        stages = [last | {"iterations": OVER_ITERATIONS, "tolerance": 0.0}]
-    elif plain and "knots_u" not in lens:
-        stages = coarse_to_fine(tuple(lens["control"]), degree, rays or base, (nx, ny), quality, sampler=sampler)
-    else:
-        stages = [
-            on_rays(
-                lens["control"],
-                rays or base,
-                sampler,
-                apron=math.ceil(0.04 * max(nx, ny)),
-                iterations=default("design.stages.iterations"),
-                tolerance=2e-3 if plain else 0.0,
-            )
-        ]
-    stages += waves
-    if design["loss"].strip() == "rms":  # eq. 5.2.1 is defined on the screen only
-        stages = [stage | {"apron": 0} for stage in stages]
-    design["stages"] = stages
-
-
-def _relative_to_initial(design: dict[str, Any]) -> bool:
-    """Whether the design uses a network whose outputs are relative to an initial surface."""
-    return design["network"] != "none" and design.get("preconditioner") == "laplacian"
-
-
-def _of_array(control: Sequence[int], degree: Sequence[int], array: Sequence[int]) -> list[int]:
-    """The least admissible numbers of control points of a lenslet array, at least `control`; unchanged for a single lens."""
-    return [array_control(n, p, k) if k > 1 else n for n, p, k in zip(control, degree, array, strict=True)]
-
-
-def without_waves(s: Settings, given: bool) -> str:
-    """Why `waves = "auto"` omits the wave image from complete settings although diffraction matters, and how to include it.
-
-    given: whether the stages are user-defined.
-    """
-    design = s["design"]
-    if any(stage.get("waves") for stage in design["stages"]):
-        return ""
-    if given:
-        return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
-    if (seen := _resolution(s, build_source(s))).source > seen.pixel:
-        return "that of a source whose blur is wider than a pixel takes many times as long; ⟨waves⟩ on refines it all the same"
-    return _not_by_default(s) or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; ⟨waves⟩ on takes it"
-
-
-def _not_by_default(s: Settings) -> str:
-    """The feature for which `waves = "auto"` never refines the wave image, and how to include it; "" if there is none."""
-    design = s["design"]
-    if "gradient" in s["lens"]:
-        return "wave images are implemented for homogeneous lenses only"
-    if elements_of(s):
-        return "wave images are implemented for a single lens only"
-    if s["source"]["type"] == "rays":
-        return "a ray file contains no phase"
-    if s["source"].get("also"):
-        return "light of several sources is refined by rays alone"
-    if design["network"] != "none":
-        return "a network is trained on rays alone; ⟨network⟩ none refines it"
-    if design["optimizer"] != "lbfgs":
-        return f"{design['optimizer']} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it"
-    if build_screen(s).curved:
-        return "a curved screen has no wave image"
-    if max(value_of(s["lens"], "lens.array")) > 1:
-        return "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on refines it"
-    if any(s["screen"].get("tilt", ())):
-        return "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same"
-    return ""
-
-
-def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Table]:
-    """Stages that refine the wave image after the ray image, on request or where diffraction matters."""
-    design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
-    if asked == "on" and design["network"] != "none":
-        raise InputError("⟨design.waves⟩ on needs network none: the wave image is refined by control heights")
-    if asked == "on" and "gradient" in lens:
-        raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
-    if asked == "on" and source.rays is not None:
-        raise InputError("⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine")
-    if asked == "on" and build_screen(s).curved:
-        raise InputError("⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine")
-    if asked == "on" and len(source.members) > 1:
-        raise InputError("⟨design.waves⟩ on needs one source: light of several is refined by rays alone")
-    if asked == "off" or (asked == "auto" and _not_by_default(s)):
-        return []
-    seen = _resolution(s, source)
-    if asked == "auto" and (seen.source > seen.pixel or not seen.matters):
-        return []
-    own = s["source"].get("wavelengths", [])
-    plan = wave_refinement(_wave_samples(s, seen, lit), len(own), quality, timed=asked == "auto")
-    apron = math.ceil(0.04 * max(screen["resolution"]))
-    return [on_waves(lens["control"], list(map(float, own)) or white(count), apron, n) for count, n in plan]
-
-
-def _resolution(s: Settings, source: Source) -> Resolution:
-    """The resolution limit of complete settings."""
-    return Resolution.before(Scene(source, build_lens(s), build_screen(s), build_light(s)), tuple(s["target"]["size"]))
-
-
-def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
-    """Estimated number of samples of the field at one wavelength: space-bandwidth product of the lens and the blurred bright
-    region."""
-    throw, shortest = abs(s["screen"]["z"]), min(s["source"].get("wavelengths", []) or BAND[:1]) * 1e-6
-    return math.prod(
-        w * (part * t + 4.0 * seen.diffraction) / (shortest * throw)
-        for w, t, part in zip(s["lens"]["size"], s["target"]["size"], lit, strict=True)
-    )
-
-
-def _quality(time_limit: float, source: Source) -> str:
-    """The quality that a time limit permits at 250 x 250 pixels on two cores."""
-    seconds = time_limit / (EXTENDED if source.extended else 1.0)
-    return "draft" if seconds < DRAFT_SECONDS else "fine" if FINE_SECONDS <= seconds < math.inf else "standard"
-
-
-def _shifts(s: Settings, source: Source) -> bool:
-    """Whether the source's extent only shifts the image."""
-    lens = build_lens({**s, "lens": {"control": [LEAST_SPANS] * 2, **s["lens"]}})
-    return source_spread(Scene(source, lens, build_screen(s), build_light(s))) is not None
-
-
-def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, per_pixel2: float | None = None) -> Filter:
-    """A reconstruction filter; the Gaussian's alpha in 1/mm^2 or 1/pixel^2 (default 1 per pixel^2)."""
-    if per_mm2 is not None and per_pixel2 is not None:
-        raise InputError("alpha_per_mm2 and alpha_per_pixel2 say the same thing twice: give one of them")
-    if kind == "bincount":
-        size = (1, 1)
-    alpha = (0.0, 0.0)
-    if kind == "gaussian":
-        if per_mm2 is not None:
-            alpha = per_mm2 * screen.pixel[0] * screen.pixel[0], per_mm2 * screen.pixel[1] * screen.pixel[1]
-        else:
-            alpha = (1.0 if per_pixel2 is None else per_pixel2,) * 2
-    return Filter(kind, tuple(size), alpha)
-
-
-def build_stages(settings: Settings) -> list[Stage]:
-    """The stages of complete settings.
-
-    Raises:
-        InputError: there are none, a value is out of range, or the last stage does not use the lens' control net.
-    """
-    stages = [stage_of(table, settings) for table in settings["design"].get("stages", [])]
-    if not stages:
-        raise InputError("[[design.stages]] at least one stage is needed")
-    if list(stages[-1].control) != list(settings["lens"]["control"]):
-        raise InputError(
-            f"[[design.stages]] the last stage's control {list(stages[-1].control)} must be the lens' own,"
-            f" {settings['lens']['control']}"
-        )
-    return stages
-
-
-def stage_of(table: Table, settings: Settings) -> Stage:
-    """The stage of a table of complete settings."""
-    t = stage_base(settings, "grid") | table
-    filter = filter_from(
-        t["reconstruction"], t["filter_size"], build_screen(settings), t.get("alpha_per_mm2"), t.get("alpha_per_pixel2")
-    )
-    source = build_source(settings, type=t["source"]) if "source" in t else None
-    return Stage(
-        tuple(t["control"]),
-        t["rays"],
-        t["sampler"],
-        filter,
-        t["blur"],
-        t["apron"],
-        t["iterations"],
-        t["tolerance"],
-        source,
-        t["oversample"],
-        tuple(t.get("waves", ())),
-        value_of(t, "design.stages.spread"),
-        value_of(t, "design.stages.lenslets"),
-    )
-
-
-def build_options(settings: Settings) -> Options:
-    """The design options of complete settings."""
-    d = settings["design"]
-    for key in ("dtype", "seed", "iterations"):
-        check(f"design.{key}", d[key])
-    for key in ("time_limit", "checkpoint_every"):  # which may be infinite
-        if not d[key] > 0:
-            raise InputError(f"⟨design.{key}⟩ must be greater than 0 s, got {d[key]:g}")
-    return Options(
-        d["loss"],
-        d["optimizer"],
-        d["lr"],
-        d["network"],
-        d["initial"],
-        d["preconditioner"],
-        d["filter_target"],
-        d["seed"],
-        getattr(torch, d["dtype"]),
-        d["max_slope"],
-        d["min_radius"],
-        d["waves"] == "on",
-        content(d, "robust", Tolerances),
-        Architecture(*(value_of(d, f"design.{key}") for key in ("network_layers", "network_width", "activation"))),
-        Ranges.parse(value_of(d, "design.over")),
     )

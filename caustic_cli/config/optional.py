@@ -7,27 +7,17 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.config.default_stages import (
-    TWO_SIDED_SPANS,
-    Table,
-    completed_stage,
-    refinement,
-    refinement_spans,
-    two_sided,
-    usual_sampler,
-)
+from caustic_cli.config.default_stages import Table
 from caustic_cli.config.settings import Settings, build_source, elements_of, value_of
 from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
-from caustic_cli.scene import Source
 from caustic_cli.scene.elements import check_compatible_with_elements
 
 OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
 BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
-#: For a free gradient: half range about the index; degree of its splines, knot spans per pixel and their largest number; and
-#: largest number of rays per pixel, since they cost more.
-HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS, RAYS_BENT = 0.05, 3, 2, 768, 16
+#: For a free gradient: half range about the index; degree of its splines, knot spans per pixel and their largest number.
+HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS = 0.05, 3, 2, 768
 
 
 def centre_screen(over: Ranges, s: Settings, given: Settings, throw: float | None) -> None:
@@ -134,24 +124,6 @@ def complete_second_size(s: Settings) -> None:
     check("second.size", second["size"])
 
 
-def complete_two_sided(s: Settings, source: Source, quality: str, rays: int | None) -> None:
-    """Complete the design settings of a lens with two free-form sides."""
-    lens, screen, design = s["lens"], s["screen"], s["design"]
-    if design["start"] != "transport":
-        raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {design['start']}")
-    if design["waves"] == "on":
-        raise InputError("⟨design.waves⟩ on: two free-form sides are refined by rays alone")
-    if "control" not in lens:
-        lens["control"] = [min(TWO_SIDED_SPANS, refinement_spans(max(screen["resolution"]), quality)) + p for p in lens["degree"]]
-    design.setdefault("preconditioner", "laplacian")
-    if "stages" not in design:
-        design["stages"] = two_sided(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)
-        return
-    design["stages"] = [completed_stage(stage, s, usual_sampler(source)) for stage in design["stages"]]
-    if any(stage.get(key) for stage in design["stages"] for key in ("waves", "spread")):
-        raise InputError("[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread")
-
-
 def complete_elements(s: Settings) -> None:
     """Default sizes of other lenses and mirrors, and checks of unsupported combinations."""
     tables, design = [dict(table) for table in elements_of(s)], s["design"]
@@ -199,30 +171,3 @@ def complete_blank(lens: Table, screen: Table, index: float) -> None:
         check(f"lens.{key}", value_of(lens, f"lens.{key}"))
     if not lens["index_range"][0] < lens["index_range"][1]:
         raise InputError(f"⟨lens.index_range⟩ must ascend, got {lens['index_range']}")
-
-
-def complete_index_design(s: Settings, source: Source, quality: str, rays: int | None) -> None:
-    """Complete the design settings of a free gradient: L-BFGS from optimal transport, on rays."""
-    lens, screen, design = s["lens"], s["screen"], s["design"]
-    if not source.collimated:
-        raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
-    if max(value_of(lens, "lens.array")) > 1:
-        raise InputError("⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat")
-    if value_of(s["target"], "target.color"):
-        raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
-    if robust := design.get("robust"):
-        raise InputError(
-            f"⟨design.robust⟩ {robust} averages over errors of a designed surface, but ⟨lens.gradient⟩ free designs the index"
-        )
-    if design.setdefault("start", "offset") not in ("offset", "transport"):
-        raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design['start']}")
-    for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
-        if design[key] != only:
-            raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
-    if check("design.waves", design["waves"]) == "on":
-        raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
-    design["start"] = "offset"  # of the surface, which is flat; the index starts from optimal transport
-    design.setdefault("preconditioner", "laplacian")
-    if "stages" not in design:
-        last = refinement(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)[-1]
-        design["stages"] = [last | {"rays": rays or min(last["rays"], RAYS_BENT * math.prod(screen["resolution"]))}]

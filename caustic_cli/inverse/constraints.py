@@ -13,10 +13,12 @@ heights.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from caustic_cli.config.table import check_all
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.optics import curvature
@@ -32,6 +34,30 @@ LEFT, SPARE = 1e-3, 1e-3
 STEPS = 400
 #: Points evaluated at a time, which bounds the memory.
 BLOCK = 400_000
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a designed surface."""
+
+    #: Of the slope |grad z|, 0 for none.
+    max_slope: float = 0.0
+    #: Least radius of curvature of concave regions, mm, 0 for any.
+    min_radius: float = 0.0
+
+    def __post_init__(self):
+        check_all("design", self, "max_slope", "min_radius")
+
+    def feasible(self, field: HeightField, heights: Tensor, bounds: tuple[Tensor, Tensor], side: int, rounded: bool) -> Tensor:
+        """`within_limits` for a surface that is machined from +z, or from -z (side -1), where concave and convex are exchanged.
+
+        rounded: False leaves the radius out.
+        """
+        radius = self.min_radius if rounded else 0.0
+        if side > 0:
+            return within_limits(field, heights, bounds, self.max_slope, radius)
+        low, high = bounds
+        return -within_limits(field, -heights, (-high, -low), self.max_slope, radius)
 
 
 def within_limits(

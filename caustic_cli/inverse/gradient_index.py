@@ -31,12 +31,12 @@ from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Evaluation, Objective
 from caustic_cli.inverse.parametrisation import FreeHeights
+from caustic_cli.inverse.schedule import Rendering
 from caustic_cli.inverse.surface_from_map import integrate
 from caustic_cli.inverse.transport import corners, solve
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.gradient.fields import SplineIndex
-from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces import HeightField, Plane
 from caustic_cli.optics.system import ENTRANCE, EXIT, Element, Medium, System
@@ -184,11 +184,9 @@ class _IndexObjective(Objective):
             scene,
             flat,
             sampler,
-            Filter("cosine", (3, 3)),
             torch.from_numpy(np.ascontiguousarray(target, dtype=np.float64)),
             "rms-light",
-            apron=apron,
-            oversample=OVERSAMPLE,
+            Rendering(apron=apron, oversample=OVERSAMPLE),
             dtype=torch.float64,
         )
 

@@ -26,12 +26,9 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import CELLS, first_surface
-from caustic_cli.inverse.losses import ColorLoss, Loss
-from caustic_cli.inverse.objective import Evaluation
-from caustic_cli.inverse.robust import SceneObjective
+from caustic_cli.inverse.mixture import Case, Mixture, SceneObjective
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Scene
 
 NEEDS_DISTANT_SOURCE = (
@@ -149,7 +146,7 @@ def initial_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[in
     )
 
 
-class ArrayObjective:
+def array_objective(parts: Sequence[Lenslet], objective: Callable[[int, Lenslet], SceneObjective]) -> Mixture:
     """The loss of an array as a function of its heights, each lenslet against its own target.
 
         L = sqrt(mean over lenslets of L_k^2),    L_k the loss of lenslet k as a lens by itself
@@ -161,20 +158,7 @@ class ArrayObjective:
         parts: the lenslets of the array.
         objective: returns the loss of a lenslet, given its number.
     """
-
-    def __init__(self, parts: Sequence[Lenslet], objective: Callable[[int, Lenslet], SceneObjective]):
-        self.parts = list(parts)
-        self.each = [objective(k, one) for k, one in enumerate(self.parts)]
-        self.loss: Loss | ColorLoss = self.each[0].loss
-
-    def __call__(self, heights: Tensor) -> Evaluation:
-        """Value, gradient, fraction of the light on the screen and image at heights (n, m) mm float64 of the array."""
-        found = [loss(one.of(heights)) for loss, one in zip(self.each, self.parts, strict=True)]
-        total = float(np.sqrt(np.mean([e.loss**2 for e in found])))
-        gradient = found[0].gradient.new_zeros(heights.shape)
-        for e, one in zip(found, self.parts, strict=True):
-            gradient[one.rows, one.columns] += (e.loss / (total * len(found)) if total > 0 else 0.0) * e.gradient
-        shares = [one.share for one in self.parts]
-        image = torch.stack([share * e.image for share, e in zip(shares, found, strict=True)]).sum(0)
-        on_screen = sum(share * e.on_screen for share, e in zip(shares, found, strict=True))
-        return Evaluation(total, {EXIT: gradient}, on_screen, image)
+    return Mixture(
+        [Case(objective(k, one), 1.0 / len(parts), one.share, one.share, (one.rows, one.columns)) for k, one in enumerate(parts)],
+        2.0,
+    )

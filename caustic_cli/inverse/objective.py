@@ -1,8 +1,13 @@
 """The objective function: the loss of control heights and its gradient, for a fixed set of rays.
 
-    Scene + heights -> trace -> landing points, weights -> reconstruct -> image -> loss
+    Scene + heights -> trace -> landing points, weights -> reconstruct -> image on each screen -> loss
 
-Everything that does not depend on the heights (basis matrices, filtered target, blur) is made once.
+An objective is a sum over channels, each the image on a screen against its target, and over further scalar terms, sums over rays:
+
+    loss = sqrt(sum_c weight_c t_c^2 + sum_j weight_j s_j / P_out + penalties of the surface) / pixels
+
+with t_c the loss of channel c (`losses`), s_j a sum over rays, and P_out the power that leaves the lens.  Everything that does not
+depend on the heights (basis matrices, filtered target, blur) is made once.
 """
 
 from __future__ import annotations
@@ -17,18 +22,19 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from caustic_cli.inverse import ranks
+from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.loss_terms import PENALTIES, parse
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.penalties import Penalty
+from caustic_cli.inverse.schedule import Rendering
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.memory import smaller_chunk
-from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, Screen
 
 #: Rays traced at a time, and most rays whose prepared chunks are kept between evaluations; and the same for tensor grids of axial
 #: rays, which need little memory per ray: 8e6 on 2000 x 2000 pixels take 0.6 s, by 2^20 at a time 3 s.
@@ -52,71 +58,131 @@ class Evaluation:
         return torch.stack([*self.gradients.values()]) if len(self.gradients) > 1 else self.gradients[EXIT]
 
 
-def penalty_of(
-    scene: Scene, field: HeightField, loss: str, max_slope: float, min_radius: float, device: str | torch.device
-) -> Penalty:
+def penalty_of(scene: Scene, field: HeightField, loss: str, limits: Limits, device: str | torch.device) -> Penalty:
     """The penalty terms of the surface, from a loss and the limits."""
     terms = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
-    return Penalty(scene, field, terms, max_slope, device, min_radius)
+    return Penalty(scene, field, terms, limits.max_slope, device, limits.min_radius)
+
+
+@dataclass(frozen=True)
+class SourceBlur:
+    """What the extent of the source does to the image of its points.
+
+    spread: convolution for the image of each point, with the section of the source that it represents; empty for rays of the whole
+    source.  The image is then traced on a margin from which light is spread onto screen and apron.
+    expected: fraction of the light that can be on screen and apron behind the blur.
+    """
+
+    spread: Sequence[Convolution] = ()
+    expected: float = 1.0
+
+    @property
+    def cut(self) -> int:
+        """Subdivisions of a pixel in the images that are convolved."""
+        return self.spread[0].cut if self.spread else 1
+
+    @property
+    def beside(self) -> tuple[int, int]:
+        """Pixels of the margin along each axis."""
+        return tuple(n // self.cut for n in self.spread[0].beside) if self.spread else (0, 0)
+
+    def spread_out(self, images: Tensor) -> Tensor:
+        """The image on screen and apron of the whole source, from those of its points."""
+        if not self.spread:
+            return images[0]
+        return sum(
+            torch.stack([spread(c) for c in image]) if image.ndim == 3 else spread(image)
+            for spread, image in zip(self.spread, images, strict=True)
+        )
+
+    def expected_power(self, seen: Tensor, leaving: Tensor) -> Tensor:
+        """Power to which the loss normalises an image: all that leaves the lens; with a blur that in the image, but at least what
+        can be expected there."""
+        return torch.maximum(seen.sum((-2, -1)), self.expected * leaving) if self.spread else leaving
+
+
+SHARP = SourceBlur()
+
+
+class Channel:
+    """The image on one screen, compared with its target.
+
+    Args:
+        screen: of the picture; target: (n_x, n_y) irradiance there, or (3, n_x, n_y) in colour.
+        loss: weighted terms, see `losses.parse`; how: see `Rendering`; blur: of the source.
+    """
+
+    def __init__(self, screen: Screen, target: Tensor, loss: str, how: Rendering, blur: SourceBlur = SHARP):
+        self.how, self.cut = how, blur.cut
+        grown = screen.grown(tuple(how.apron + n for n in blur.beside))
+        self.screen = replace(grown, resolution=tuple(how.oversample * n for n in grown.resolution))
+        wide = torch.nn.functional.pad(target.double(), (how.apron,) * 4)
+        smooth = wide
+        if how.filter_target:
+            fine = wide.repeat_interleave(how.oversample, -2).repeat_interleave(how.oversample, -1)
+            colors = [how.filter.smooth(c) for c in fine.reshape(-1, *fine.shape[-2:])]
+            smooth = self._pool(torch.stack(colors).view(fine.shape), 1)
+        self.loss = (Loss if target.ndim == 2 else ColorLoss)(loss, smooth, how.blur, how.apron, wide > 0)
+        cells = how.oversample // self.cut
+        self.shape = (*target.shape[:-2], *(n // cells for n in self.screen.resolution))
+
+    def _pool(self, image: Tensor, cut: int) -> Tensor:
+        """Pixels of the screen, each subdivided by `cut` along each axis, from those of the render, by summation."""
+        k, (*colors, n, m) = self.how.oversample // cut, image.shape
+        if k == 1:
+            return image
+        return avg_pool2d(image.view(-1, n, m), k, divisor_override=1).view(*colors, n // k, m // k)  # sums; faster than .sum
+
+    def pooled(self, image: Tensor) -> Tensor:
+        """An image of the render on the pixels that are compared, or convolved with the blur of the source."""
+        return self._pool(image, self.cut)
+
+    def inner(self, image: Tensor) -> Tensor:
+        """The screen without its apron."""
+        a = self.how.apron
+        return image[..., a : image.shape[-2] - a, a : image.shape[-1] - a]
 
 
 class Objective:
-    """The loss as a function of the heights.
+    """The loss as a function of the heights, for the image on the scene's screen; a subclass adds channels and terms.
 
     Args:
         scene: with the screen of the picture.
         field: spline spaces of the heights.
         sampler: the rays, the same at every evaluation; or a list with those of several points of the source.
-        filter: reconstruction filter.
         target: (n_x, n_y) irradiance on the scene's screen, or (3, n_x, n_y) of a coloured scene.
         loss: weighted terms, see `losses.parse`.
-        blur: pixels, see `Loss`.
-        filter_target: filter the target as the render is filtered.
-        apron: pixels of a dark guard band around the target, in which light beside the screen contributes to the loss.
-        max_slope: limit of the lens' slope, 0 for none; min_radius: least radius of concave regions, mm, 0 for any.
-        oversample: the filter is applied on pixels smaller by this factor along each axis, which are then summed: a render
-            close to a bincount, and yet differentiable with respect to the heights.
-        spread: convolution for the image of each point, with the section of the source that it represents; empty for rays of the
-            whole source.  The image is then traced on a margin from which light is spread onto screen and apron.
-        expected: fraction of the light that can be on screen and apron behind the blur of the source.
+        how: render and comparison, see `Rendering`.
+        limits: of the surface, enforced by penalties.
+        blur: of the source, where `sampler` has the rays of its points.
         dtype: precision of the rays.
     """
+
+    #: Most chunks of a staged trace whose graphs are kept for the gradient; more are traced twice.
+    graphs = 1
+    #: Number of sums over rays beyond images and the power that leaves the lens.
+    further = 0
 
     def __init__(
         self,
         scene: Scene,
         field: HeightField,
         sampler: Rays | Sequence[Rays],
-        filter: Filter,
         target: Tensor,
         loss: str,
+        how: Rendering | None = None,
+        limits: Limits | None = None,
         *,
-        blur: float = 0.0,
-        filter_target: bool = True,
-        apron: int = 0,
-        max_slope: float = 0.0,
-        min_radius: float = 0.0,
-        oversample: int = 1,
-        spread: Sequence[Convolution] = (),
-        expected: float = 1.0,
+        blur: SourceBlur = SHARP,
         dtype: torch.dtype = torch.float32,
     ):
         self.samplers = list(sampler) if isinstance(sampler, Sequence) else [sampler]
         self.device = self.samplers[0].device
-        self.spread, self.cut = list(spread), spread[0].cut if spread else 1
-        beside = (n // self.cut for n in spread[0].beside) if spread else (0, 0)
-        screen = scene.screen.grown(tuple(apron + n for n in beside))
-        self.screen = replace(screen, resolution=tuple(oversample * n for n in screen.resolution))
-        self.filter, self.apron, self.oversample = filter, apron, oversample
-        wide = torch.nn.functional.pad(target.double().to(self.device), (apron, apron, apron, apron))
-        smooth = wide
-        if filter_target:
-            fine = wide.repeat_interleave(oversample, -2).repeat_interleave(oversample, -1)
-            smooth = self._pool(torch.stack([filter.smooth(c) for c in fine]) if scene.colored else filter.smooth(fine))
-        self.loss = (ColorLoss if scene.colored else Loss)(loss, smooth, blur, apron, wide > 0)
-        self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, self.device)
-        self.scene, self.field, self.dtype = scene, field, dtype
-        self.expected, self.chunk, self.kept, kept = expected, CHUNK, None, KEPT_RAYS
+        self.channels = [Channel(scene.screen, target.to(self.device), loss, how or Rendering(), blur)]
+        self.loss = self.channels[0].loss
+        self.penalty = penalty_of(scene, field, loss, limits or Limits(), self.device)
+        self.scene, self.field, self.dtype, self.blur = scene, field, dtype, blur
+        self.chunk, self.kept, kept = CHUNK, None, KEPT_RAYS
         try:
             if self._rows():
                 self.chunk, kept = CHUNK_OF_ROWS, KEPT_OF_ROWS
@@ -128,7 +194,9 @@ class Objective:
     def moved(self, scene: Scene, rays: Rays) -> Objective:
         """The same objective for another position of screen or source and other rays, sharing the filtered target."""
         other = copy.copy(self)
-        other.scene, other.screen, other.samplers = scene, replace(self.screen, z=scene.screen.z), [rays]
+        channel = copy.copy(self.channels[0])
+        channel.screen = replace(channel.screen, z=scene.screen.z)
+        other.scene, other.channels, other.samplers = scene, [channel], [rays]
         other.kept = None if self.kept is None else list(other._tracers())
         return other
 
@@ -136,35 +204,14 @@ class Objective:
     def whole(self) -> bool:
         """Whether the graphs of all chunks are kept: a fused kernel stores the net or the surface at its rays, a staged trace every
         ray after each stage."""
-        return self.kept is not None and (sum(t.fused is None for _, t in self.kept) <= 1)
+        return self.kept is not None and (sum(t.fused is None for _, t in self.kept) <= self.graphs)
 
     def _rows(self) -> bool:
         """Whether the rays are a tensor grid of an axial plane wave, for which there is a fused kernel."""
-        if not (self.screen.upright and all(isinstance(s, Sampler) and s.tensor for s in self.samplers)):
+        if not (self.scene.screen.upright and all(isinstance(s, Sampler) and s.tensor for s in self.samplers)):
             return False
         _, first = next(self._tracers(), (0, None))
         return first is not None and first.fused is not None and first.start.along_axis
-
-    def _pool(self, image: Tensor, cut: int = 1) -> Tensor:
-        """Pixels of the screen, each subdivided by `cut` along each axis, from those of the render, by summation."""
-        k, (*colors, n, m) = self.oversample // cut, image.shape
-        if k == 1:
-            return image
-        return avg_pool2d(image.view(-1, n, m), k, divisor_override=1).view(*colors, n // k, m // k)  # sums; faster than .sum
-
-    def _spread_out(self, images: Tensor) -> Tensor:
-        """The image on screen and apron of the whole source, from those of its points."""
-        if not self.spread:
-            return images[0]
-        return sum(
-            torch.stack([spread(c) for c in image]) if image.ndim == 3 else spread(image)
-            for spread, image in zip(self.spread, images, strict=True)
-        )
-
-    def _expected_power(self, seen: Tensor, leaving: Tensor) -> Tensor:
-        """Power to which the loss normalises an image: all that leaves the lens; with a blur that in the image, but at least what
-        can be expected there."""
-        return torch.maximum(seen.sum((-2, -1)), self.expected * leaving) if self.spread else leaving
 
     def _tracers(self) -> Iterator[tuple[int, Tracer]]:
         """Tracers of the chunks of this rank, each with the index of its source point."""
@@ -181,10 +228,9 @@ class Objective:
     def evaluate(self, parameters: Parameters) -> Evaluation:
         """Value and gradients at heights {name of a surface: (n, m) mm float64}.
 
-        The loss depends on the rays through the image alone.  So the image is accumulated chunk by chunk, the loss is
-        differentiated with respect to the image, and each chunk is traced again for the vector-Jacobian product: memory does not
-        grow with the number of rays.  Small graphs are kept instead of tracing again.  When memory runs out, smaller chunks are
-        tried.
+        The loss depends on the rays through images and sums alone.  So these are accumulated chunk by chunk, the loss is
+        differentiated with respect to them, and each chunk is traced again for the vector-Jacobian product: memory does not grow
+        with the number of rays.  Small graphs are kept instead of tracing again.  When memory runs out, smaller chunks are tried.
 
         Raises:
             CausticError: out of memory, or no light reaches the screen.
@@ -204,46 +250,68 @@ class Objective:
             ranks.broadcast(heights)
             heights.requires_grad_()
         leaves = list(parameters.values())
-        penalty = self.penalty(parameters[EXIT]) if self.penalty else torch.zeros((), device=self.device)
-        shape = tuple(n // (self.oversample // self.cut) for n in self.screen.resolution)
-        shape = (3, *shape) if self.scene.colored else shape
-        image = torch.zeros((len(self.samplers), *shape), dtype=torch.float64, device=self.device)
-        leaving, entering, parts = image.new_zeros(shape[:-2]), image.new_zeros(shape[:-2]), []  # one for each colour
-        with torch.set_grad_enabled(self.whole):
-            for k, traced in self.kept or self._tracers():
-                part = self._see(traced, parameters)
-                image[k] += part[0].detach()
-                leaving, entering = leaving + part[1].detach().double(), entering + traced.entering.double()
-                if self.whole:
-                    parts.append((k, part))
-        ranks.all_reduce(image, leaving, entering)
-        image, leaving = image.requires_grad_(), leaving.requires_grad_()
-        seen = self._spread_out(image)
-        loss = self.loss(seen, self._expected_power(seen, leaving), penalty, entering)
-        wanted = [image, leaving, *leaves] if penalty.requires_grad else [image, leaving]
-        by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
+        penalty = self._penalty(parameters) if self.penalty else torch.zeros((), device=self.device)
+        sums, entering, parts = self._sums(parameters)
+        ranks.all_reduce(*sums, entering)
+        for value in sums:
+            value.requires_grad_()
+        seen = [self.blur.spread_out(images) for images in sums[: len(self.channels)]]
+        loss = self._loss(seen, sums[len(self.channels) :], penalty, entering)
+        wanted = [*sums, *leaves] if penalty.requires_grad else sums
+        found = torch.autograd.grad(loss, wanted, allow_unused=True)
+        by, direct = found[: len(sums)], found[len(sums) :] or (None,) * len(leaves)
         gradients = [torch.zeros_like(heights) for heights in leaves]
         for k, part in parts or ((k, self._see(traced, parameters)) for k, traced in self.kept or self._tracers()):
             # Bincount images, and the power that leaves a lens without reflections, do not depend on the heights.
             pulls = [
-                (value, by.to(value.dtype))
-                for value, by in zip(part, (by_image[k], by_leaving), strict=True)
-                if value.requires_grad and by is not None
+                (value, pull.to(value.dtype))
+                for value, pull in zip(part, self._of_point(by, k), strict=True)
+                if pull is not None and value.requires_grad
             ]
             if pulls:
-                values, by = zip(*pulls, strict=True)
-                for gradient, more in zip(gradients, torch.autograd.grad(values, leaves, by, allow_unused=True), strict=True):
+                values, pulled = zip(*pulls, strict=True)
+                for gradient, more in zip(gradients, torch.autograd.grad(values, leaves, pulled, allow_unused=True), strict=True):
                     if more is not None:
                         gradient += more
         ranks.all_reduce(*gradients)
-        for gradient, more in zip(gradients, direct or [None] * len(gradients), strict=True):
+        for gradient, more in zip(gradients, direct, strict=True):
             if more is not None:
                 gradient += more
-        a = self.apron
-        inner = seen.detach()[..., a : seen.shape[-2] - a, a : seen.shape[-1] - a]
+        inner = self.channels[0].inner(seen[0].detach())
         return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()), inner)
 
-    def _see(self, traced: Tracer, parameters: Parameters) -> tuple[Tensor, Tensor]:
-        """Contribution of a chunk to the image, and to the power that leaves the lens."""
-        part = traced.expose(parameters, self.screen, self.filter)
-        return self._pool(part.image, self.cut), part.leaving
+    def _sums(self, parameters: Parameters) -> tuple[list[Tensor], Tensor, list[tuple[int, list[Tensor]]]]:
+        """Accumulated contributions of all chunks, see `_see`, images with an axis of source points in front; the power that
+        enters; and the contributions with their graphs, where these are kept."""
+        zero = torch.zeros(self.channels[0].shape[:-2], dtype=torch.float64, device=self.device)  # one for each colour
+        sums = [zero.new_zeros(len(self.samplers), *channel.shape) for channel in self.channels]
+        sums += [zero.clone() for _ in range(1 + self.further)]
+        entering, parts = zero.clone(), []
+        with torch.set_grad_enabled(self.whole):
+            for k, traced in self.kept or self._tracers():
+                part = self._see(traced, parameters)
+                for total, more in zip(self._of_point(sums, k), part, strict=True):
+                    total += more.detach()
+                entering = entering + traced.entering.double()
+                if self.whole:
+                    parts.append((k, part))
+        return sums, entering, parts
+
+    def _of_point(self, values: Sequence[Tensor | None], k: int) -> list[Tensor | None]:
+        """Of accumulated values, or their derivatives, those of source point k."""
+        count = len(self.channels)
+        return [None if value is None else value[k] for value in values[:count]] + list(values[count:])
+
+    def _see(self, traced: Tracer, parameters: Parameters) -> list[Tensor]:
+        """Contribution of a chunk to the image of each channel, the power that leaves the lens, and further sums over rays."""
+        channel = self.channels[0]
+        part = traced.expose(parameters, channel.screen, channel.how.filter)
+        return [channel.pooled(part.image), part.leaving]
+
+    def _loss(self, seen: list[Tensor], sums: list[Tensor], penalty: Tensor, entering: Tensor) -> Tensor:
+        """The loss of the images of all channels, the power that leaves the lens, and further sums over rays."""
+        return self.loss(seen[0], self.blur.expected_power(seen[0], sums[0]), penalty, entering)
+
+    def _penalty(self, parameters: Parameters) -> Tensor:
+        """Weighted sum of squared penalties of the surfaces."""
+        return self.penalty(parameters[EXIT])

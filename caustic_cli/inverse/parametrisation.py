@@ -22,7 +22,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from scipy.fft import dctn, idctn
@@ -30,7 +31,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.config import checks
-from caustic_cli.config.table import check, default
+from caustic_cli.config.table import check, check_all, default
 from caustic_cli.errors import InputError
 
 NETWORKS = ("none", "sparse", "dense")
@@ -66,6 +67,46 @@ class Architecture:
         check("design.network_layers", self.layers)
         check("design.network_width", self.width)
         check("design.activation", self.activation)
+
+
+@dataclass(frozen=True)
+class Parametrisation:
+    """How control heights follow from the parameters that are optimised, see above.
+
+    Raises:
+        InputError: out of range, see the table, or an architecture for another network than a dense one.
+    """
+
+    network: str = "none"
+    initial: str = "zero"
+    preconditioner: str = "laplacian"
+    architecture: Architecture = field(default_factory=Architecture)
+
+    def __post_init__(self):
+        check_all("design", self, "network", "initial", "preconditioner")
+        if self.network != "dense" and self.architecture != Architecture():
+            raise InputError(
+                "⟨design.network_layers⟩, ⟨design.network_width⟩ and ⟨design.activation⟩ belong to ⟨+design.network⟩ dense,"
+                f" got {self.network}"
+            )
+
+    @property
+    def free(self) -> bool:
+        """Whether the parameters are the heights themselves, and not those of a network."""
+        return self.network == "none"
+
+    def heights(self, low: Tensor, high: Tensor, start: Tensor | None, **options: Any) -> Heights:
+        """`parametrise` with these options; degree, seed and inputs as there."""
+        return parametrise(
+            low,
+            high,
+            self.network,
+            start=start,
+            initial=self.initial,
+            preconditioner=self.preconditioner,
+            architecture=self.architecture,
+            **options,
+        )
 
 
 def cosine_transform(n: int) -> Tensor:

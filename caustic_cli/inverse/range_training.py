@@ -13,16 +13,15 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-import torch
 from torch import Tensor
 
+from caustic_cli.inverse.mixture import Case, Mixture
 from caustic_cli.inverse.objective import Evaluation, Objective
 from caustic_cli.inverse.optimisers import Adam
 from caustic_cli.inverse.parametrisation import Heights
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.sampling import stream
-from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Scene
 
 #: Size of the mini-batch: one value in each quarter of every range.
@@ -56,10 +55,8 @@ class RangeObjective:
     def __call__(self, heights: Tensor, iteration: int) -> Evaluation:
         """Mean loss, its gradient (k, n, m), mean fraction of the light on the screen and mean image, of heights (k, n, m) mm at
         the parameter values of an iteration."""
-        found = [loss(z) for loss, z in zip(self.at(iteration), heights, strict=True)]
-        loss, on_screen = (sum(getattr(e, name) for e in found) / len(found) for name in ("loss", "on_screen"))
-        gradient = torch.stack([e.gradient for e in found]) / len(found)
-        return Evaluation(loss, {EXIT: gradient}, on_screen, torch.stack([e.image for e in found]).mean(0))
+        part = 1.0 / BATCH
+        return Mixture([Case(one, part, part, part, (k,)) for k, one in enumerate(self.at(iteration))], 1.0)(heights)
 
 
 class RangeAdam(Adam):

@@ -10,19 +10,15 @@ antithetic pairs, so that every error has zero mean.  The scene of a draw is the
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.losses import ColorLoss, Loss
-from caustic_cli.inverse.objective import Evaluation
+from caustic_cli.inverse.mixture import Case, Mixture, SceneObjective
 from caustic_cli.optics.form_error import FormErrors
 from caustic_cli.optics.misalignment import Misalignment, reason_ignored
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances, hypercube
 
@@ -32,17 +28,10 @@ PAIRS, POWER, WEIGHT = 2, 2.0, 0.1
 PURPOSE = 2
 
 
-class SceneObjective(Protocol):
-    """The loss in a single scene."""
-
-    loss: Loss | ColorLoss
-
-    def __call__(self, heights: Tensor) -> Evaluation:
-        """Value and gradient at heights (n, m) mm."""
-
-
-class RobustObjective:
-    """The loss as a function of the heights; see above.
+def robust_objective(
+    objective: Callable[[Scene, Tensor], SceneObjective], scene: Scene, field: HeightField, begun: Tensor, tolerances: Tolerances
+) -> Mixture:
+    """The loss over draws as a function of the heights; see above.  Its image is that without errors.
 
     Args:
         objective: returns the loss in a scene, near heights (n, m) mm.
@@ -52,43 +41,22 @@ class RobustObjective:
     Raises:
         InputError: none of the errors applies to the scene.
     """
-
-    def __init__(
-        self,
-        objective: Callable[[Scene, Tensor], SceneObjective],
-        scene: Scene,
-        field: HeightField,
-        begun: Tensor,
-        tolerances: Tolerances,
-    ):
-        parameters = tuple(p for p in tolerances.parameters if p.error != "roughness" and not reason_ignored(scene, p.error))
-        fits = tolerances.surface and _resolves(field, tolerances.shortest)
-        if not (parameters or fits):
-            raise InputError("⟨design.robust⟩ names no error that a design can take into account in this scene")
-        surfaces = FormErrors(field, tolerances.form, tolerances.waviness) if fits else None
-        rng = np.random.default_rng([tolerances.seed, PURPOSE, 1])
-        self.parts: list[tuple[SceneObjective, Tensor | float]] = [(objective(scene, begun), 0.0)]
-        for row in hypercube(parameters, PAIRS, tolerances.seed, PURPOSE):
-            surface = surfaces.heights(rng, tolerances.surface) if surfaces else 0.0
-            for sign in (-1.0, 1.0):
-                values = {(p.error, p.axis): sign * float(v) for p, v in zip(parameters, row, strict=True)}
-                errors = Misalignment.of(values)
-                added = sign * surface + errors.thickness
-                self.parts.append((objective(errors.upright(scene), begun + added), added))
-        self.loss = self.parts[0][0].loss
-
-    def __call__(self, heights: Tensor) -> Evaluation:
-        """Value, gradient and mean fraction of the light on the screen at heights (n, m) mm float64; the image without errors."""
-        found = [part(heights + added) for part, added in self.parts]
-        losses = torch.tensor([e.loss for e in found], dtype=torch.float64)
-        share = torch.full_like(losses, WEIGHT / max(1, len(found) - 1))
-        share[0] = 1.0 - WEIGHT
-        level = float(losses.max())
-        loss = level * float((share * (losses / level) ** POWER).sum() ** (1.0 / POWER)) if level > 0 else 0.0
-        weights = share * (losses / loss) ** (POWER - 1.0) if loss > 0 else torch.zeros_like(losses)
-        gradient = sum(float(w) * e.gradient for w, e in zip(weights, found, strict=True))
-        on_screen = sum(e.on_screen for e in found) / len(found)
-        return Evaluation(loss, {EXIT: torch.as_tensor(gradient)}, on_screen, found[0].image)
+    parameters = tuple(p for p in tolerances.parameters if p.error != "roughness" and not reason_ignored(scene, p.error))
+    fits = tolerances.surface and _resolves(field, tolerances.shortest)
+    if not (parameters or fits):
+        raise InputError("⟨design.robust⟩ names no error that a design can take into account in this scene")
+    surfaces = FormErrors(field, tolerances.form, tolerances.waviness) if fits else None
+    rng, count = np.random.default_rng([tolerances.seed, PURPOSE, 1]), 2 * PAIRS
+    seen = 1.0 / (count + 1)
+    cases = [Case(objective(scene, begun), 1.0 - WEIGHT, seen, 1.0)]
+    for row in hypercube(parameters, PAIRS, tolerances.seed, PURPOSE):
+        surface = surfaces.heights(rng, tolerances.surface) if surfaces else 0.0
+        for sign in (-1.0, 1.0):
+            values = {(p.error, p.axis): sign * float(v) for p, v in zip(parameters, row, strict=True)}
+            errors = Misalignment.of(values)
+            added = sign * surface + errors.thickness
+            cases.append(Case(objective(errors.upright(scene), begun + added), WEIGHT / count, seen, 0.0, added=added))
+    return Mixture(cases, POWER)
 
 
 def _resolves(field: HeightField, shortest: float) -> bool:

@@ -19,42 +19,54 @@ RAYS_A_WAVE = 600_000
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One stage of a design.
+class Rendering:
+    """How the image inside a loss is rendered, and compared with its target."""
 
-    Args:
-        control: control points along x and y; the surface of the stage before is represented on them.
-        rays: number of rays; sampler: see `caustic_cli.optics.sampling`.
-        filter: reconstruction filter of the render inside the loss.
-        blur: standard deviation of the Gaussian blur of render and target in the loss, pixels.
-        apron: pixels added around the screen, dark in the target, that catch stray light.
-        iterations: optimiser iterations; the last stage continues to the total of the design.
-        source: the source during this stage, None for that of the scene (6.4: a point first, then the grid).
-        tolerance: ends the stage when ten iterations lowered the loss by less than this part; 0 never.
-        oversample: see `Objective`.
-        waves: nm, wavelengths of the wave image, which is optimised instead of the ray image, unless the scene gives its own; empty
-            for the ray image.
-        spread: rays are traced from the centre of the source, and their image is convolved with that of the source, where this is
-            a good approximation.
-        lenslets: each lenslet of an array is compared with its own target, see `lenslets.ArrayObjective`.
-    """
-
-    control: tuple[int, int]
-    rays: int
-    sampler: str = "lines"
+    #: Reconstruction filter.
     filter: Filter = field(default_factory=lambda: Filter("cosine", (3, 3)))
+    #: Standard deviation of the Gaussian blur of render and target, pixels.
     blur: float = default("design.stages.blur")
+    #: Pixels of a dark guard band around the target, in which light beside the screen contributes to the loss.
     apron: int = default("design.stages.apron")
-    iterations: int = 30
-    tolerance: float = 2e-3
-    source: Source | None = None
+    #: The filter is applied on pixels smaller by this factor along each axis, which are then summed: a render close to a bincount,
+    #: and yet differentiable with respect to the heights.
     oversample: int = default("design.stages.oversample")
+    #: Whether the target is filtered as the render is.
+    filter_target: bool = True
+
+    def __post_init__(self):
+        check_all("design.stages", self, "blur", "apron", "oversample")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a design."""
+
+    #: Control points along x and y; the surface of the stage before is represented on them.
+    control: tuple[int, int]
+    #: Number of rays.
+    rays: int
+    #: See `caustic_cli.optics.sampling`.
+    sampler: str = "lines"
+    #: The render inside the loss, and its comparison with the target.
+    rendering: Rendering = field(default_factory=Rendering)
+    #: Optimiser iterations; the last stage continues to the total of the design.
+    iterations: int = 30
+    #: Ends the stage when ten iterations lowered the loss by less than this part; 0 never.
+    tolerance: float = 2e-3
+    #: The source during this stage, None for that of the scene (6.4: a point first, then the grid).
+    source: Source | None = None
+    #: Wavelengths, nm, of the wave image, which is optimised instead of the ray image, unless the scene gives its own; empty for
+    #: the ray image.
     waves: tuple[float, ...] = ()
+    #: Rays are traced from the centre of the source, and their image is convolved with that of the source, where this is a good
+    #: approximation.
     spread: bool = default("design.stages.spread")
+    #: Each lenslet of an array is compared with its own target, see `lenslets.array_objective`.
     lenslets: bool = default("design.stages.lenslets")
 
     def __post_init__(self):
-        check_all("design.stages", self, "control", "rays", "blur", "apron", "iterations", "tolerance", "oversample", "waves")
+        check_all("design.stages", self, "control", "rays", "iterations", "tolerance", "waves")
         checks.choice("⟨design.stages.sampler⟩", self.sampler, SAMPLERS)
 
     @property
@@ -62,3 +74,10 @@ class Stage:
         """Estimated cost of all its iterations, in units of one traced ray."""
         each = RAYS_A_WAVE * len(self.waves) if self.waves else self.rays
         return self.iterations * (each + 20.0 * self.control[0] * self.control[1])
+
+    @property
+    def light(self) -> str:
+        """How its image is made, as a phrase."""
+        if self.waves:
+            return f"the wave image at {', '.join(f'{w:.4g}' for w in self.waves)} nm"
+        return f"{self.rays:,} rays, blur {self.rendering.blur:g} px"

@@ -128,9 +128,9 @@ def regular_rays(
     pixel, each = scene.screen.pixel, math.ceil((spread.usual / (EXACT * max(spread.reach()))) ** 2)
     if each <= 1 or not min(spread.half) > 0:
         scene = replace(scene, source=point_source(scene))
-        return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, stage.oversample)]
+        return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, stage.rendering.oversample)]
     each = min(each, MOST_MODES)
-    parts = spread.parts_on(pixel, spots(scene.source, each), stage.oversample)
+    parts = spread.parts_on(pixel, spots(scene.source, each), stage.rendering.oversample)
     return scene, RegularGrid.of_modes(modes(scene, each), stage.rays, device), parts
 
 

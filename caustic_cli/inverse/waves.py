@@ -19,8 +19,10 @@ import torch
 from torch import Tensor
 
 from caustic_cli.inverse import ranks
+from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.objective import Evaluation, penalty_of
+from caustic_cli.inverse.schedule import Rendering
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves.image import Imager, Line, lines_of
@@ -59,7 +61,7 @@ class WaveObjective:
         scene: with the screen of the picture.
         field: spline spaces of the heights.
         heights: h_0 (n, m) mm.
-        target, loss, blur, apron, max_slope, min_radius: as of an `Objective`.
+        target, loss, limits: as of an `Objective`; how: only its blur and apron apply.
         wavelengths: nm, of equal weight, for a scene that gives none; empty for those of white light.
         dtype: of fields; paths are float64.
 
@@ -74,21 +76,20 @@ class WaveObjective:
         heights: Tensor,
         target: Tensor,
         loss: str,
+        how: Rendering | None = None,
+        limits: Limits | None = None,
         *,
         wavelengths: tuple[float, ...] = (),
-        blur: float = 0.0,
-        apron: int = 0,
-        max_slope: float = 0.0,
-        min_radius: float = 0.0,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ):
-        self.scene, self.field, self.apron, self.dtype = scene, field, apron, dtype
+        how = how or Rendering()
+        self.scene, self.field, self.apron, self.dtype = scene, field, how.apron, dtype
         self.middle = heights.detach().double().to(device)
-        screen = scene.screen.grown((apron, apron))
-        wide = torch.nn.functional.pad(target.double().to(device), (apron,) * 4)
-        self.loss = (ColorLoss if scene.colored else Loss)(loss, wide, blur, apron, wide > 0)
-        self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, device)
+        screen = scene.screen.grown((how.apron, how.apron))
+        wide = torch.nn.functional.pad(target.double().to(device), (how.apron,) * 4)
+        self.loss = (Loss if target.ndim == 2 else ColorLoss)(loss, wide, how.blur, how.apron, wide > 0)
+        self.penalty = penalty_of(scene, field, loss, limits or Limits(), device)
         lines = lines_of(scene, field, None if scene.light.wavelengths else wavelengths or None)
         rank, count = ranks.rank_and_size()
         parameters = {EXIT: self.middle}

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import build_options, build_stages, complete, complete_source
+from caustic_cli.config.completion import complete, complete_source
+from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.errors import InputError, no_project, plain
 from caustic_cli.inverse.designer import Designer, State
@@ -25,6 +25,7 @@ from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.target import target_on_screen, tiles
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
+from caustic_cli.kinds import problem_of
 from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
@@ -236,10 +237,8 @@ class Project:
         """Heights (n, m), mm, from the network at the parameter values."""
         if not state.parameters:
             raise self.error("holds no network yet: design it first")
-        middle = self._scene(None)
-        target = torch.from_numpy(self.target(middle))
-        designer = Designer(middle, target, build_stages(self.settings), build_options(self.settings))
-        return designer.heights_at(state, self.values or ())
+        problem = problem_of(replace(self, values=None))
+        return problem.heights_at(Designer(problem), state, self.values or ())
 
     def write(self, path: Path | None = None) -> None:
         """Write project.toml and all files to an existing directory, that of the project by default.

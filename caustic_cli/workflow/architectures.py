@@ -10,17 +10,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from caustic_cli.config.completion import build_options, build_stages, complete
-from caustic_cli.config.settings import build_scene
+from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.designer import Designer, InitialHeights, Options
-from caustic_cli.inverse.parametrisation import Architecture
-from caustic_cli.inverse.scene_parameters import Range, Ranges
+from caustic_cli.inverse.designer import Designer, InitialHeights
+from caustic_cli.inverse.parametrisation import Architecture, Parametrisation
+from caustic_cli.inverse.problem import Options
+from caustic_cli.io.picture import Picture
+from caustic_cli.kinds import OneSurface, problem_of
 from caustic_cli.project.project import Project
-from caustic_cli.scene import Scene
-from caustic_cli.studies.retrace import retrace
-from caustic_cli.workflow import range_evaluation
-from caustic_cli.workflow.comparison import disc
+from caustic_cli.workflow.comparison import picture_of_disc
 from caustic_cli.workflow.design import first_heights
 
 #: Grid of hyperparameters: hidden layers, neurons in each, activations, learning rates, and preconditioners of the output.
@@ -77,17 +75,9 @@ class Candidate:
 
     def judged(self) -> dict[str, float]:
         """Figures error, worst and noise, see `studies.architectures.COLUMNS`."""
-        found = []
-        for designer, state in zip(self.designers, self.states, strict=True):
-            if designer.options.over is not None:
-                found += range_evaluation.errors(
-                    designer, state, self.target, rays=self.rays, seed=self.seed, device=designer.device, middle=False
-                )
-                continue
-            field, device = designer.field(state.stage), designer.device
-            found.append(
-                retrace(designer.scene, field, state.heights, self.target, rays=self.rays, seed=self.seed, device=device)[1]
-            )
+        found: list[dict] = []
+        for one, state in zip(self.designers, self.states, strict=True):
+            found += one.problem.errors(one, state, self.rays, self.seed, middle=False)
         errors, noises = (np.array([row[key] or 0.0 for row in found]) for key in ("relative_rms", "noise"))
         error = float(np.sqrt(np.mean(errors**2)))
         noise = float(np.sqrt(np.sum((errors * noises) ** 2)) / (error * len(found))) if error > 0 else 0.0
@@ -109,60 +99,53 @@ def candidates(
     first: InitialHeights | None = None
     if project is None:
         full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
-        scene = build_scene(full)
-        target = disc(scene, tuple(full["target"]["size"]))
-    else:
-        if project.over is not None and project.settings["design"]["start"] != "offset":
-            project, first = first_heights(project, project.settings)
-        full, scene = project.settings, project.scene()
-        target = project.target(scene)
-    stages = [s for s in build_stages(full) if not s.waves]
+        project = Project(None, full, Picture(picture_of_disc(), "linear"))
+    over = project.over
+    full = {key: value for key, value in project.settings["design"].items() if key != "robust"}
+    project = replace(project, settings=project.settings | {"design": full})
+    problem = problem_of(project, device)
+    if over is not None and full["start"] != "offset":
+        _, adapted, first = first_heights(project, project.settings, problem)
+        problem = adapted or problem
+    scene, stages, own = problem.scene, [s for s in problem.stages if not s.waves], problem.options
     if not stages or scene.second is not None or scene.lens.arrayed:
         raise InputError(
             "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
         )
-    stage = replace(stages[-1], blur=0.0, iterations=10**9, tolerance=0.0, source=None, spread=False, control=scene.lens.control)
-    own, goal = build_options(full), torch.from_numpy(target)
-    base = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed, optimizer="adam", robust=None)
+    last = stages[-1]
+    how = replace(last.rendering, blur=0.0)
+    stage = replace(last, rendering=how, iterations=10**9, tolerance=0.0, source=None, spread=False, control=scene.lens.control)
+    base = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed, optimizer="adam")
     count = rays or RAYS_PER_PIXEL * math.prod(scene.screen.resolution)
 
-    def made(name: str, options: Options, inputs: str = "", each: list[tuple[Scene, Options]] | None = None) -> Candidate:
-        dense = options.network == "dense"
-        shape = options.architecture
+    def made(name: str, options: Options, inputs: str = "", each: list[OneSurface] | None = None) -> Candidate:
+        how = options.parametrisation
+        dense, shape = how.network == "dense", how.architecture
         about = {
-            "series": f"{name}, {options.preconditioner}, lr {options.lr:g}",
-            "network": options.network,
+            "series": f"{name}, {how.preconditioner}, lr {options.lr:g}",
+            "network": how.network,
             "inputs": inputs,
             "layers": shape.layers if dense else None,
             "width": (shape.width or math.prod(scene.lens.control)) if dense else None,
             "activation": shape.activation if dense else None,
-            "preconditioner": options.preconditioner,
+            "preconditioner": how.preconditioner,
             "lr": options.lr,
         }
-        designers = [Designer(one, goal, [stage], how, device) for one, how in each or [(scene, options)]]
-        return Candidate(about, designers, first, target, count, base.seed)
+        designers = [Designer(one.varied([stage], options)) for one in each or [problem]]
+        return Candidate(about, designers, first, problem.target.numpy(), count, base.seed)
 
-    over, found = own.over, []
-    outputs, activations = (OUTPUTS, ACTIVATIONS) if over is None else ((own.preconditioner,), (own.architecture.activation,))
+    found, before = [], own.parametrisation
+    outputs, activations = (OUTPUTS, ACTIVATIONS) if over is None else ((before.preconditioner,), (before.architecture.activation,))
     for output, lr, act, layers, width in itertools.product(outputs, RATES, activations, LAYERS, WIDTHS):
-        options = replace(
-            base, network="dense", initial="zero-last", preconditioner=output, lr=lr, architecture=Architecture(layers, width, act)
-        )
+        network = Parametrisation("dense", "zero-last", output, Architecture(layers, width, act))
+        options = replace(base, parametrisation=network, lr=lr)
         found.append(made(f"{layers} x {width} {act}", options, "" if over is None else "range"))
     if over is None:
         for output, lr in itertools.product(OUTPUTS, FREE_RATES):
-            free = replace(base, network="none", initial="zero", preconditioner=output, lr=lr, architecture=Architecture())
-            found.append(made("no network", free))
+            found.append(made("no network", replace(base, parametrisation=Parametrisation(preconditioner=output), lr=lr)))
         return found
-    found.append(made("as designed", replace(own, dtype=base.dtype, seed=base.seed), "range"))
-    blind = replace(own, dtype=base.dtype, seed=base.seed, inputs=False)
-    found.append(made("one lens for all", blind, "none"))
-    alone = [
-        (
-            over.scene(scene, values),
-            replace(blind, over=Ranges(tuple(Range(k, v, v) for k, v in zip(over.keys, values, strict=True)))),
-        )
-        for values in over.evaluation_points()
-    ]
-    found.append(made("each value alone", blind, "alone", alone))
+    again = replace(own, dtype=base.dtype, seed=base.seed)
+    found.append(made("as designed", again, "range"))
+    found.append(made("one lens for all", again, "none", [problem.blind()]))
+    found.append(made("each value alone", again, "alone", [problem.blind(values) for values in over.evaluation_points()]))
     return found

@@ -11,16 +11,20 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import NETWORK_CONTROL, build_options, build_stages, complete, stage_of
+from caustic_cli.config.completion import complete
 from caustic_cli.config.default_stages import LEAST_CELLS, coarse_to_fine
+from caustic_cli.config.design import stage_of
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.designer import Designer, Options, State
+from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import first_surface
-from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.parametrisation import Heights
-from caustic_cli.inverse.schedule import Stage
+from caustic_cli.inverse.parametrisation import Heights, Parametrisation
+from caustic_cli.inverse.problem import LossOfHeights, Options, Problem
+from caustic_cli.inverse.schedule import Rendering, Stage
 from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.io.picture import Picture
+from caustic_cli.kinds import problem_of
+from caustic_cli.kinds.surface import NETWORK_CONTROL
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
@@ -38,12 +42,12 @@ TRANSPORT = "lbfgs, from transport"
 class CachingDesigner(Designer):
     """A designer that caches the objective of a stage between time slices."""
 
-    _kept: tuple[int, Objective] | None = None
+    _kept: tuple[int, LossOfHeights] | None = None
 
-    def _objective(self, k: int, heights: Heights) -> Objective:
+    def objective(self, k: int, heights: Heights) -> LossOfHeights:
         if self._kept is None or self._kept[0] != k:
             self._kept = None  # released first: objectives are large
-            self._kept = k, super()._objective(k, heights)
+            self._kept = k, super().objective(k, heights)
         return self._kept[1]
 
 
@@ -55,9 +59,9 @@ class TimedDesign:
         CausticError: no light reaches the screen.
     """
 
-    def __init__(self, series: str, stages: list[Stage], options: Options, scene: Scene, target: Tensor, device: str = "cpu"):
-        self.series, self.optimizer, self.network = series, options.optimizer, options.network
-        self.designer = CachingDesigner(scene, target, stages, options, device)
+    def __init__(self, series: str, problem: Problem):
+        self.series, self.optimizer, self.network = series, problem.options.optimizer, problem.options.parametrisation.network
+        self.designer, target = CachingDesigner(problem), problem.target
         self.designer.run(self._begin(target), iterations=1)  # warm-up: compilation and caches
         self.state, self.done, self.pixels = self._begin(target), False, target.numel()
         self.waited = self.state.seconds
@@ -124,13 +128,10 @@ def timed_designs(
     """
     if project is None:
         full = complete({"screen": {"resolution": [PIXELS, PIXELS]}, "lens": {"control": [CONTROL, CONTROL]}}, 1.0)
-        scene = settings.build_scene(full)
-        target = disc(scene, tuple(full["target"]["size"]))
-    else:
-        full, scene = project.settings, project.scene()
-        target = project.target(scene)
-    goal = torch.from_numpy(target)
-    return scene, target, [TimedDesign(*plan, scene, goal, device) for plan in variants(scene, full, dtype, seed)]
+        project = Project(None, full, Picture(picture_of_disc(), "linear"))
+    problem = problem_of(project, device)
+    runs = [TimedDesign(name, problem.varied(*how)) for name, *how in variants(problem, project.settings, dtype, seed)]
+    return problem.scene, problem.target.numpy(), runs
 
 
 def lens_of_disc() -> tuple[Scene, HeightField, Tensor]:
@@ -153,7 +154,7 @@ def picture_of_disc() -> np.ndarray:
 
 
 def variants(
-    scene: Scene, full: Settings, dtype: torch.dtype | None = None, seed: int | None = None
+    problem: Problem, full: Settings, dtype: torch.dtype | None = None, seed: int | None = None
 ) -> list[tuple[str, list[Stage], Options]]:
     """Name, stages and options of every design run; dtype and seed replace those of the settings.
 
@@ -164,12 +165,12 @@ def variants(
     Raises:
         InputError: a setting is out of range, or no stage is on rays.
     """
-    on_rays, options = [s for s in build_stages(full) if not s.waves], build_options(full)
+    scene, on_rays, options = problem.scene, [s for s in problem.stages if not s.waves], problem.options
     if not on_rays:
         raise InputError("[[design.stages]] all have waves; designs are compared on rays, so one stage on rays is needed")
     last = on_rays[-1]
     options = replace(options, dtype=dtype or options.dtype, seed=options.seed if seed is None else seed)
-    last = replace(last, blur=0.0, iterations=ENDLESS, tolerance=0.0, source=None)
+    last = replace(last, rendering=replace(last.rendering, blur=0.0), iterations=ENDLESS, tolerance=0.0, source=None)
     lens = scene.lens
     nets = (
         [lens.control]
@@ -181,14 +182,14 @@ def variants(
             )
         )
     )
-    newton = replace(options, optimizer="lbfgs", network="none", initial="zero", preconditioner="laplacian")
+    newton = replace(options, optimizer="lbfgs", parametrisation=Parametrisation())
     found = [(f"lbfgs, {_net(net)}", [replace(last, control=net)], newton) for net in nets]
     if len(nets) > 1:
         stages = [
             stage_of(table, full)
             for table in coarse_to_fine(lens.control, lens.degree, last.rays, scene.screen.resolution, sampler=last.sampler)
         ]
-        stages = [replace(s, filter=last.filter, apron=0 if options.loss == "rms" else s.apron) for s in stages]
+        stages = [replace(s, rendering=_rendering(s, last, options)) for s in stages]
         stages[-1] = replace(stages[-1], iterations=ENDLESS, tolerance=0.0)
         found.append(("lbfgs, coarse to fine", stages, newton))
     net = (
@@ -198,12 +199,22 @@ def variants(
     )
     if full["design"]["start"] == "transport":
         found.append((TRANSPORT, [replace(last, control=lens.control)], newton))
-    adam = replace(options, optimizer="adam", initial="zero", preconditioner="none")
     for kind in ("none", "sparse", "dense"):
         if kind != "dense" or math.prod(net) <= NETWORK_CONTROL**2:  # weights: the square of the control points
             name = "adam" if kind == "none" else f"adam, {kind} network"
-            found.append((f"{name}, {_net(net)}", [replace(last, control=net)], replace(adam, network=kind)))
+            found.append((f"{name}, {_net(net)}", [replace(last, control=net)], _by_adam(options, kind)))
     return found
+
+
+def _rendering(stage: Stage, last: Stage, options: Options) -> Rendering:
+    """The rendering of a stage with the filter of the last one; the loss rms is defined on the screen only."""
+    how = replace(stage.rendering, filter=last.rendering.filter)
+    return replace(how, apron=0) if options.loss == "rms" else how
+
+
+def _by_adam(options: Options, network: str) -> Options:
+    architecture = options.parametrisation.architecture
+    return replace(options, optimizer="adam", parametrisation=Parametrisation(network, "zero", "none", architecture))
 
 
 def _net(control: tuple[int, int]) -> str:

@@ -11,40 +11,34 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from caustic_cli import __version__
 from caustic_cli.config import presets, settings
-from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, shape_words, without_waves
-from caustic_cli.config.default_stages import transport_cells
+from caustic_cli.config.completion import PLATE, WALL, Derivation, complete, shape_words
 from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.config.table import TABLE
+from caustic_cli.config.wave_stages import without_waves
 from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, InitialHeights, State
-from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
-from caustic_cli.inverse.initial_two_sided import first_sides
-from caustic_cli.inverse.lenslets import initial_array
-from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.reachability import largest_magnification
 from caustic_cli.inverse.scene_parameters import Ranges
-from caustic_cli.inverse.sharpness import advice
-from caustic_cli.inverse.source_limits import best_irradiance, point_source, source_spread
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
-from caustic_cli.optics.emission.measured import coarse_words
-from caustic_cli.optics.obstruction import clear_shift, refuse_obstructed
-from caustic_cli.optics.resolution import Resolution
+from caustic_cli.kinds import OneSurface, kind_of, problem_of
+from caustic_cli.kinds.evaluation import Evaluated
+from caustic_cli.optics.obstruction import clear_shift
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate
@@ -52,10 +46,9 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, Project, is_project
 from caustic_cli.scene import Scene
-from caustic_cli.studies.manufacture import preview, wall_and_stock
+from caustic_cli.studies.manufacture import wall_and_stock
 from caustic_cli.workflow.compilation import announce_compilation, compile_usual
 from caustic_cli.workflow.evaluation import evaluate_and_write, evaluation_seconds, expected_seconds
-from caustic_cli.workflow.gradient_index import design_index, index_figures, is_free, limit_of
 from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Reporter
 
@@ -68,8 +61,20 @@ DONE = ("iterations", "no progress")
 LEAST_PART, START_PART = 0.25, 0.3
 #: Time of a checkpoint, s, beyond which the interval to the next one grows, and the factor of the excess.
 QUICK, RARELY = 0.5, 10.0
-#: Least number of source cells along a lenslet.
-LEAST_CELLS = 128
+
+
+class Begun(NamedTuple):
+    """A design about to be run: its project, its problem, None where it exists already, and its initial heights, None for the
+    offset surface."""
+
+    project: Project
+    problem: OneSurface | None = None
+    first: InitialHeights | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the design."""
+        return self.project.scene() if self.problem is None else self.problem.scene
 
 
 def begin(
@@ -83,8 +88,8 @@ def begin(
     recorded: bool = False,
     say: Reporter,
     device: str = "cpu",
-) -> tuple[Project, InitialHeights | None]:
-    """Validate all input, then create the project directory, if any; also returns the initial heights, None for the offset surface.
+) -> Begun:
+    """Validate all input, then create the project directory, if any.
 
     If the same design exists already, finished or not, its project is opened instead (`Project.found`).
 
@@ -169,21 +174,25 @@ def begin(
         uptodate.digest(full, picture, light, second),
         without_waves=without_waves(full, "stages" in said.get("design", {})),
     )
-    if recorded and is_free(project):
-        raise InputError("⟨movie⟩ records the design of a surface; ⟨lens.gradient⟩ free designs the index")
+    return _begun(project, said, force, recorded, say, device)
+
+
+def _begun(project: Project, said: Settings, force: bool, recorded: bool, say: Reporter, device: str) -> Begun:
+    """`begin` of a project whose settings are complete, `said` those that the user gave."""
+    out = project.path
+    kind = kind_of(project.settings)
+    if recorded and kind.no_movie:
+        raise InputError(kind.no_movie)
     if out is not None and not force:
         if same := uptodate.same_design(out, project.asked):
-            return replace(same[0], found=same[1]), None
+            return Begun(replace(same[0], found=same[1]))
         force = uptodate.is_begun(out, project.asked)  # and interrupted before the first checkpoint: it is begun anew
-    designer, goal = _designer(project, "cpu")  # builds and thereby validates scene, target, stages, options
-    for scene in designer.scenes:
-        refuse_obstructed(scene)
+    problem = kind.of(project, device)  # builds and thereby validates scene, target, stages, options
+    problem.refuse_obstructed()
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
-    if designer.scene.second is None and not designer.scene.elements:
-        for scene in designer.scenes:
-            refuse_unreachable(scene, grey(goal))
-    if words := shape_words(full):
+    problem.refuse_unreachable()
+    if words := shape_words(project.settings):
         say.say(words)
     compile_usual(device, say)
     with (
@@ -191,15 +200,15 @@ def begin(
         say.notify_if_slow("solving the transport of the light to the picture"),
     ):
         try:
-            project, first = first_heights(project, said)
+            begun = first_heights(project, said, problem)
         except OutOfReach as error:
-            most = largest_magnification(designer.scene, project.settings["target"]["size"])
+            most = largest_magnification(problem.scene, project.settings["target"]["size"])
             most = min(most or 0.0, TABLE["mag"].high)
             within = f"; ⟨+mag⟩ of at most about {at_most(most, 2)} is within reach at this throw" if most else ""
             raise InputError(f"{error}{within}") from error
     if out is not None:
-        directory.create(project, force)
-    return project, first
+        directory.create(begun.project, force)
+    return begun
 
 
 def _beside_the_light(full: Settings) -> tuple[float, float]:
@@ -208,27 +217,33 @@ def _beside_the_light(full: Settings) -> tuple[float, float]:
     return clear_shift([scene] if over is None else over.ends(scene)) or (0.0, 0.0)
 
 
-def first_heights(project: Project, said: Settings) -> tuple[Project, InitialHeights | None]:
-    """Initial heights of a design, None for the offset surface; and the project with thickness and height range adapted to them,
-    except for values `said` by the user.
+def first_heights(project: Project, said: Settings, problem: OneSurface) -> Begun:
+    """The initial heights of a design; and its project and problem with thickness and height range adapted to them, except for
+    values `said` by the user.
 
     Raises:
         InputError: as of `begin`.
     """
     fixed, project = "thickness" in said.get("lens", {}), replace(project, settings=copy.deepcopy(project.settings))
-    lens = project.settings["lens"]
-    first, middle = _solved(project, fixed)
-    if "second" in project.settings:
-        return project, _designer(project, "cpu")[0].initial_heights(first)
-    if middle is not None:
+    lens, built = project.settings["lens"], copy.deepcopy(project.settings["lens"])
+
+    def current() -> OneSurface:
+        """The problem, with the lens as adapted so far."""
+        nonlocal problem, built
+        if lens != built:
+            problem, built = problem_of(project, problem.device), copy.deepcopy(lens)
+        return problem
+
+    first, middle = _solved(project, problem, fixed)
+    if problem.adapts and middle is not None:
         lens["thickness"] = middle
-    if first is not None and not fixed and (spare := _spare(lens, said, first)) > 0:
-        lens["thickness"] -= spare
-        first, middle = _solved(project, fixed=True)[0], lens["thickness"]
-    if first is not None and _make_room(project.settings, said, first) and middle is None:
-        _designer(project, "cpu")
-        first, _ = _solved(project, fixed)
-    return project, _designer(project, "cpu")[0].initial_heights(first)
+    if problem.adapts and first is not None:
+        if not fixed and (spare := _spare(lens, said, first)) > 0:
+            lens["thickness"] -= spare
+            first, middle = _solved(project, current(), fixed=True)[0], lens["thickness"]
+        if _make_room(project.settings, said, first) and middle is None:
+            first, _ = _solved(project, current(), fixed)
+    return Begun(project, current(), Designer(problem).initial_heights(first))
 
 
 @dataclass(frozen=True)
@@ -247,71 +262,61 @@ class Result:
     figures: dict[str, Any]
 
 
-def design(
-    project: Project, first: InitialHeights | None, device: str, say: Reporter, began: float, movie: Movie | None = None
-) -> Result:
+def design(begun: Begun, device: str, say: Reporter, began: float, movie: Movie | None = None) -> Result:
     """Run a new design from its initial heights to its end; movie: records it.
 
     A finished design found by `begin` is returned; an unfinished one is continued.
     """
-    if project.found is not None:
-        figures = uptodate.finished(project, project.found)
-        say.say(
-            f"{project.path}: was designed from the same picture with the same options, so "
-            + (
-                "there is nothing to do; ⟨force⟩ designs it anew"
-                if figures
-                else "it is designed again"
-                if is_free(project)
-                else "it continues from its checkpoint"
-            )
-        )
-        if not figures and is_free(project):
-            project.hold.enter_context(directory.locked(project.path))
-            return design(replace(project, asked=uptodate.asked_of(project, project.found), found=None), None, device, say, began)
-        if not figures:
-            return resume(project, None, None, device, say, began, movie)
-        if movie is not None:
-            say.say(f"{movie.path}: is not written, since no design was run")
-        scene = project.scene()
-        target = project.target(scene)
-        scene, field, heights, checkpoint = project.lens(scene)
-        return Result(project, scene, field, heights, target, checkpoint.state, figures)
+    project, problem, first = begun
+    if problem is None:
+        return _again(project, device, say, began, movie)
     with project.hold:
-        if is_free(project):
-            return _run_index(project, say, began, device)
-        designer, target = _designer(project, device)
-        _say_limits(project, designer, target, first, say)
-        return _run(project, designer, target, designer.begin(*first or ()), say, began, None, device, movie)
+        if not problem.in_stages:
+            return _run_index(project, problem, say, began)
+        _say_limits(project, problem, first, say)
+        return _run(project, problem, Designer(problem).begin(*first or ()), say, began, None, movie)
 
 
-def _say_limits(project: Project, designer: Designer, target: np.ndarray, first: InitialHeights | None, say: Reporter) -> None:
+def _again(project: Project, device: str, say: Reporter, began: float, movie: Movie | None) -> Result:
+    """The result of a design found by `begin`."""
+    figures = uptodate.finished(project, project.found)
+    anew = kind_of(project.settings).no_resume
+    say.say(
+        f"{project.path}: was designed from the same picture with the same options, so "
+        + (
+            "there is nothing to do; ⟨force⟩ designs it anew"
+            if figures
+            else "it is designed again"
+            if anew
+            else "it continues from its checkpoint"
+        )
+    )
+    if not figures and anew:
+        project.hold.enter_context(directory.locked(project.path))
+        project = replace(project, asked=uptodate.asked_of(project, project.found), found=None)
+        return design(Begun(project, problem_of(project, device)), device, say, began)
+    if not figures:
+        return resume(project, None, None, device, say, began, movie)
+    if movie is not None:
+        say.say(f"{movie.path}: is not written, since no design was run")
+    scene = project.scene()
+    target = project.target(scene)
+    scene, field, heights, checkpoint = project.lens(scene)
+    return Result(project, scene, field, heights, target, checkpoint.state, figures)
+
+
+def _say_limits(project: Project, problem: OneSurface, first: InitialHeights | None, say: Reporter) -> None:
     """Report the limits set by diffraction and an extended source, and manufacturing figures of the initial surface."""
-    light = grey(project.picture.irradiance())
+    light, chosen = grey(project.picture.irradiance()), project.settings["design"]
     if (ground := float((light >= NEARLY * light.max()).mean())) > GROUND and light.min() < 0.5 * light.max():
         say.say(f"{ground:.0%} of the picture are at its maximum: for a drawing on white, ⟨invert⟩ makes the lines bright")
-    if coarse := coarse_words(designer.scene):
-        say.say(coarse)
-    seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
-    if not designer.scene.elements:
-        say.say(seen.sentence())
-    timed = math.isfinite(project.settings["design"]["time_limit"])
-    words = designer.source_limits(SMOOTH_STEPS if timed else None).sentence()
-    if words:
+    size, timed = tuple(project.settings["target"]["size"]), math.isfinite(chosen["time_limit"])
+    for words in problem.notes(size, timed, project.without_waves if chosen["waves"] == "auto" else ""):
         say.say(words)
-    if designer.scene.joint:
-        return
-    if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
-        say.say(f"the wave image is not refined: {project.without_waves}")
-    field = designer.field(0)
-    heights = designer.begin().heights if first is None else first.heights
+    heights = Designer(problem).begin().heights if first is None else first.heights
     nets = 3 if first is not None and first.unrounded is not None else 2
-    say.say(preview(designer.scene, field, heights, nets * expected_bytes(heights.numel())))
-
-
-def _listed(wavelengths: tuple[float, ...]) -> str:
-    """Numbers as a comma-separated list."""
-    return ", ".join(f"{w:.4g}" for w in wavelengths)
+    for words in problem.preview(heights, nets * expected_bytes(heights.numel())):
+        say.say(words)
 
 
 def resume(
@@ -325,33 +330,45 @@ def resume(
 ) -> Result:
     """Continue from the last checkpoint; with nothing left to do, evaluate the lens again."""
     with project.hold:
-        if is_free(project):
-            raise project.error("⟨lens.gradient⟩ free cannot be resumed: design it anew, with more ⟨iterations⟩")
+        if words := kind_of(project.settings).no_resume:
+            raise project.error(words)
         project.hold.enter_context(directory.locked(project.path))
-        designer, target = _designer(project, device)
-        for scene in designer.scenes:
-            refuse_obstructed(scene)
+        problem = problem_of(project, device)
+        problem.refuse_obstructed()
+        designer = Designer(problem)
         begun = (project.path / CHECKPOINT).exists()  # else it was killed before its first checkpoint
         before = project.load() if begun else None
-        state = before.state if begun else designer.begin(*designer.initial_heights(_solved(project, fixed=True)[0]) or ())
-        if state.stage >= len(designer.stages):
-            raise project.error(f"has {len(designer.stages)} stages, but the checkpoint is in stage {state.stage + 1}")
-        if tuple(state.heights.shape[-2:]) != designer.stages[state.stage].control:
-            raise project.error(
-                f"stage {state.stage + 1} has control"
-                f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}"
-            )
-        if state.start is not None and tuple(state.start.shape[-2:]) != designer.stages[0].control:
-            raise project.error(
-                f"stage 1 has control {list(designer.stages[0].control)}, but the design began on {list(state.start.shape)}"
-            )
+        if begun:
+            state = before.state
+        else:
+            state = designer.begin(*designer.initial_heights(_solved(project, problem, fixed=True)[0]) or ())
+        _refuse_edited(project, designer, state)
         state = designer.restored(state)
         if iterations is not None:
             changed = project.settings["design"] | {"iterations": iterations}
             project = replace(project, settings=project.settings | {"design": changed})
             project.write_settings()
         project = replace(project, asked=uptodate.asked_of(project, before) if begun else uptodate.begun(project))
-        return _run(project, designer, target, state, say, began, time_limit, device, movie)
+        return _run(project, problem, state, say, began, time_limit, movie)
+
+
+def _refuse_edited(project: Project, designer: Designer, state: State) -> None:
+    """Refuse a project whose stages are no longer those of its checkpoint.
+
+    Raises:
+        InputError: they are not.
+    """
+    if state.stage >= len(designer.stages):
+        raise project.error(f"has {len(designer.stages)} stages, but the checkpoint is in stage {state.stage + 1}")
+    if tuple(state.heights.shape[-2:]) != designer.stages[state.stage].control:
+        raise project.error(
+            f"stage {state.stage + 1} has control"
+            f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}"
+        )
+    if state.start is not None and tuple(state.start.shape[-2:]) != designer.stages[0].control:
+        raise project.error(
+            f"stage 1 has control {list(designer.stages[0].control)}, but the design began on {list(state.start.shape)}"
+        )
 
 
 def follow(device: str) -> None:
@@ -360,7 +377,7 @@ def follow(device: str) -> None:
         while task := ranks.receive():
             *parts, state, limit = task
             project = Project(None, *parts)
-            _designer(project, device)[0].run(state, iterations=project.settings["design"]["iterations"], time_limit=limit)
+            Designer(problem_of(project, device)).run(state, iterations=project.settings["design"]["iterations"], time_limit=limit)
 
 
 def _on_cpu(state: State) -> State:
@@ -386,17 +403,7 @@ def sphere() -> tuple[Scene, HeightField, torch.Tensor]:
     return scene, field, torch.from_numpy(scene.lens.offset.heights(x, y))
 
 
-def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
-    scene = project.scene()
-    target = project.target(scene)
-    stages, chosen = build_stages(project.settings), build_options(project.settings)
-    own = [torch.from_numpy(one) for one in project.targets(scene)]
-    second = project.second_target(scene)
-    farther = None if second is None else torch.from_numpy(second)
-    return Designer(scene, torch.from_numpy(target), stages, chosen, device, own, farther), target
-
-
-def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float | None]:
+def _solved(project: Project, problem: OneSurface, fixed: bool) -> tuple[torch.Tensor | None, float | None]:
     """Initial heights on the control net of the first stage, by transport or from another lens, None for the offset surface as it
     is; and the thickness that belongs to them, None if unchanged.
 
@@ -408,29 +415,11 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
     """
     start = project.settings["design"]["start"]
     if start == "offset":
-        return _aimed_offset(project), None
+        return problem.offset(), None
     if start == "transport":
-        designer, target = _designer(project, "cpu")
-        scene, goal = designer.scene, grey(target)
-        if scene.second is not None:
-            return first_sides(scene, goal, project.second_target(scene), designer.field(0)), None
-        spans = min(n - p for n, p in zip(designer.stages[0].control, scene.lens.degree, strict=True))
-        cells = transport_cells(max(s.rays for s in designer.stages), not scene.source.collimated, spans)
-        spread = source_spread(scene) if designer.stages[0].spread else None
-        if spread is not None:
-            light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
-            scene, goal = replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
-        if scene.lens.arrayed:
-            goals = [goal] if len(designer.own) == 1 else [grey(own.numpy()) for own in designer.own]
-            cells = max(LEAST_CELLS, cells // max(scene.lens.array))
-            found = InitialSurface(initial_array(scene, goals, designer.stages[0].control, cells).heights)
-        else:
-            seconds = START_PART * project.settings["design"]["time_limit"]
-            found = first_surface(scene, goal, designer.field(0), cells, fixed, seconds)
-        lens = designer.scene.lens
-        short = lens.z_in + lens.min_thickness - float(found.heights.min())
-        return found.heights + 1.01 * short if fixed and short > 0 else found.heights, found.middle
-    net = _designer(project, "cpu")[0].field(0)
+        found = problem.transport(fixed, START_PART * project.settings["design"]["time_limit"])
+        return found.heights, found.middle
+    net = problem.field(0)
     if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
         return onto(*read_surface(start, net.half_size), net), None
     if not is_project(Path(start)):
@@ -445,18 +434,6 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
             f"⟨design.start⟩: the lens of {start} is {other.settings['lens']['size']} mm, not {project.settings['lens']['size']} mm"
         )
     return onto(field, heights, net), None
-
-
-def _aimed_offset(project: Project) -> torch.Tensor | None:
-    """The offset surface with the slope that turns its light to the centre of a shifted screen; None for one that is not shifted,
-    or for a network, whose heights are relative to the offset surface."""
-    scene, shift = project.scene(), project.scene().screen.shift
-    if not any(shift) or project.settings["design"]["network"] != "none":
-        return None
-    lens = scene.lens
-    x, y = (c.numpy() for c in _designer(project, "cpu")[0].field(0).control_xy())
-    slope = [c / ((lens.effective_index - 1.0) * (scene.screen.z - lens.offset.thickness)) for c in shift]
-    return torch.from_numpy(lens.offset.heights(x, y) + slope[0] * x[:, None] + slope[1] * y[None, :])
 
 
 def _spare(lens: dict[str, Any], said: Settings, first: torch.Tensor) -> float:
@@ -484,127 +461,137 @@ def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:
     return changed
 
 
+class _Watch:
+    """Called after every iteration of a design: progress, movie and checkpoints."""
+
+    def __init__(self, project: Project, designer: Designer, records: _Records, say: Reporter, movie: Movie | None):
+        self.designer, self.records, self.say, self.movie = designer, records, say, movie
+        self.chosen, self.encoding = project.settings["design"], project.settings["target"]["encoding"]
+        self.target = designer.problem.target.numpy()
+        self.total = self.chosen["iterations"] or sum(s.iterations for s in designer.stages)
+        self.stage, self.saved = -1, time.monotonic()
+        self.show: Callable[..., None] = lambda *progress: None
+
+    def __call__(self, now: State) -> None:
+        stages, stage = self.designer.stages, self.designer.stages[now.stage]
+        name = f"stage {now.stage + 1}/{len(stages)}"
+        if now.stage != self.stage:
+            self.stage = now.stage
+            self.say.say(f"{name}: {stage.control[0]} x {stage.control[1]} control points, {stage.light}")
+        _, _, loss, on_screen, _ = now.history[-1]
+        self.show(name, f"loss {loss * grey(self.target).size:.4f}  on screen {on_screen:.1%}", now.total, self.total)
+        if self.movie is not None:
+            self.movie.record(now, self.target, self.encoding, bool(stage.waves))
+        self.keep_if_due(now)
+
+    def keep_if_due(self, now: State) -> None:
+        """Write a checkpoint if the last one is old enough."""
+        if time.monotonic() - self.saved >= max(self.chosen["checkpoint_every"], RARELY * (self.records.seconds - QUICK)):
+            self.saved = time.monotonic()  # before writing, which takes time itself
+            self.records.keep(now)
+
+
 def _run(
     project: Project,
-    designer: Designer,
-    target: np.ndarray,
+    problem: OneSurface,
     state: State,
     say: Reporter,
     began: float,
     time_limit: float | None,
-    device: str,
     movie: Movie | None = None,
 ) -> Result:
-    chosen = project.settings["design"]
+    chosen, designer = project.settings["design"], Designer(problem)
     limit = chosen["time_limit"] if time_limit is None else time_limit
     timed = math.isfinite(limit)
     if timed:  # the limit includes the initial surface and the evaluation
-        after = expected_seconds(designer, target, state, device)
-        limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - after)
-    records = _Records(project, designer, device)
+        limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - expected_seconds(designer, state))
+    records = _Records(project, designer)
+    watch = _Watch(project, designer, records, say, movie)
     if movie is not None:
-        movie.screen = designer.scene.screen
-    total = chosen["iterations"] or sum(s.iterations for s in designer.stages)
-    with _signals(project.path is not None) as asked, ExitStack() as shown:
-        show = shown.enter_context(say.progress(total))
-        stage, saved = -1, time.monotonic()
-
-        def on_iteration(now: State) -> None:
-            nonlocal stage
-            if now.stage != stage:
-                stage = now.stage
-                s = designer.stages[stage]
-                light = f"the wave image at {_listed(s.waves)} nm" if s.waves else f"{s.rays:,} rays, blur {s.blur:g} px"
-                say.say(f"stage {stage + 1}/{len(designer.stages)}: {s.control[0]} x {s.control[1]} control points, {light}")
-            _, _, loss, on_screen, _ = now.history[-1]
-            show(
-                f"stage {stage + 1}/{len(designer.stages)}",
-                f"loss {loss * grey(target).size:.4f}  on screen {on_screen:.1%}",
-                now.total,
-                total,
-            )
-            if movie is not None:
-                movie.record(now, target, project.settings["target"]["encoding"], bool(designer.stages[stage].waves))
-            keep_if_due(now)
-
-        def keep_if_due(now: State) -> None:
-            nonlocal saved
-            if time.monotonic() - saved >= max(chosen["checkpoint_every"], RARELY * (records.seconds - QUICK)):
-                saved = time.monotonic()  # before writing, which takes time itself
-                records.keep(now)
-
-        records.keep(state)
-        ranks.send((project.settings, project.picture, project.profile, project.second, _on_cpu(state), limit))
-        state = designer.run(
-            state,
-            iterations=chosen["iterations"],
-            time_limit=limit,
-            stop=lambda: bool(asked),
-            on_iteration=on_iteration,
-            notice=say.say,
-        )
-        if not asked and not chosen["iterations"] and chosen["network"] == "none" and state.reason in DONE:
-            start, sharp = (None if z is None else rounded(z) for z in (state.start, state.unrounded))
-            state = replace(state, start=start, unrounded=sharp, parameters={}, optimizer={})
-        if asked:
+        movie.screen = problem.scene.screen
+    with _signals(project.path is not None) as asked:
+        with say.progress(watch.total) as watch.show:
             records.keep(state)
-            if movie is not None:
-                movie.write()
-            raise Interrupted(
-                f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
-                f" caustic design ⟨resume⟩ {project.path} continues it",
-                128 + asked[0],
+            ranks.send((project.settings, project.picture, project.profile, project.second, _on_cpu(state), limit))
+            state = designer.run(
+                state,
+                iterations=chosen["iterations"],
+                time_limit=limit,
+                stop=lambda: bool(asked),
+                on_iteration=watch,
+                notice=say.say,
             )
-        keep_if_due(state)
-        state.heights = rounded(designer.within_limits(state))
-        shown.close()
+            if not asked and not chosen["iterations"] and problem.options.parametrisation.free and state.reason in DONE:
+                start, sharp = (None if z is None else rounded(z) for z in (state.start, state.unrounded))
+                state = replace(state, start=start, unrounded=sharp, parameters={}, optimizer={})
+            if asked:
+                records.keep(state)
+                if movie is not None:
+                    movie.write()
+                raise Interrupted(
+                    f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
+                    f" caustic design ⟨resume⟩ {project.path} continues it",
+                    128 + asked[0],
+                )
+            watch.keep_if_due(state)
+            state.heights = rounded(designer.within_limits(state))
         with say.waiting("evaluation with independent rays", evaluation_seconds(designer, state)):
-            found = evaluate_and_write(project, designer, target, state, device, timed)
-        made = wall_and_stock(designer.scene, designer.field(found.state.stage), designer.exit(found.state))
-        figures = (
-            found.figures | made | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
-        )
-        if project.path is not None:
-            figures |= uptodate.made_by(project, figures.get("wave_relative_rms") is not None)
-        records.keep(found.state, figures)
+            found = evaluate_and_write(project, designer, state, timed)
+        made = wall_and_stock(problem.scene, designer.field(found.state.stage), designer.exit(found.state))
+        result = _finished(project, designer, found, made, began, records)
         if movie is not None:
             movie.finish(found.image if found.waves is None else found.waves, found.figures)
             movie.write()
             say.say(f"{movie.path}: {len(movie.frames)} frames of the design")
-            figures = figures | {"movie": str(movie.path)}
+            result = replace(result, figures=result.figures | {"movie": str(movie.path)})
         if asked:
             raise Interrupted(f"interrupted after the design had ended; {project.path} is complete", 128 + asked[0])
-    field = designer.field(found.state.stage)
-    scene, heights = split_heights(designer.scene, field, found.state.heights)
-    size = tuple(project.settings["target"]["size"])
-    if not timed and scene.second is None and (words := advice(scene, grey(target), size)):
+    if not timed and (words := problem.advice(tuple(project.settings["target"]["size"]))):
         say.say(words)
-    return Result(project, scene, field, heights, target, found.state, figures)
+    return result
 
 
-def _run_index(project: Project, say: Reporter, began: float, device: str) -> Result:
+def _run_index(project: Project, problem: OneSurface, say: Reporter, began: float) -> Result:
     """Design a free gradient index, evaluate and save it."""
+    chosen, lens = project.settings["design"], project.settings["lens"]
     with _signals(project.path is not None) as asked:
-        found = design_index(project, say, began, limit_of(project), lambda: bool(asked))
-        project, state = found.project, found.state
-        designer, target = _designer(project, device)
-        judged = evaluate_and_write(project, designer, target, state, device, math.isfinite(limit_of(project)))
-        figures = judged.figures | index_figures(project)
-        figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "reason": state.reason}
+        say.say(problem.words(lens))
+        with say.progress(chosen["iterations"] or problem.stages[-1].iterations) as show:
+            values, state = problem.iterate(lens, chosen["iterations"], began, chosen["time_limit"], lambda: bool(asked), show)
+        lens = lens | {"index_file": attachments.index_attached(values)}
+        project = replace(project, settings=project.settings | {"lens": lens})
         if project.path is not None:
-            figures |= uptodate.made_by(project, figures.get("wave_relative_rms") is not None)
-        _Records(project, designer, device).keep(state, figures)
+            project.write()
+        designer = Designer(problem_of(project, problem.device))
+        found = evaluate_and_write(project, designer, state, math.isfinite(chosen["time_limit"]))
+        figures = {"index_least": float(np.min(values)), "index_most": float(np.max(values))}
+        result = _finished(project, designer, found, figures, began, _Records(project, designer))
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is complete", 128 + asked[0])
-    return Result(project, designer.scene, designer.field(0), state.heights, target, state, figures)
+    return result
+
+
+def _finished(
+    project: Project, designer: Designer, found: Evaluated, more: dict[str, Any], began: float, records: _Records
+) -> Result:
+    """The result of an evaluated design, with `more` figures, which is saved."""
+    state = found.state
+    figures = found.figures | more
+    figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "reason": state.reason}
+    if project.path is not None:
+        figures |= uptodate.made_by(project, figures.get("wave_relative_rms") is not None)
+    records.keep(state, figures)
+    field = designer.field(state.stage)
+    scene, heights = split_heights(designer.scene, field, state.heights)
+    return Result(project, scene, field, heights, designer.problem.target.numpy(), state, figures)
 
 
 class _Records:
     """Writes the checkpoints of a design, if it has a directory."""
 
-    def __init__(self, project: Project, designer: Designer, device: str):
+    def __init__(self, project: Project, designer: Designer):
         self.project, self.designer, self.inputs = project, designer, uptodate.inputs(project)
-        self.provenance = provenance(project, device)
+        self.provenance = provenance(project, designer.problem.device)
         self._resumes = f"caustic design ⟨resume⟩ {project.path} continues from it"
         self._before = project.path is not None and (project.path / CHECKPOINT).exists()
         self._safe = f"the one before is intact, {self._resumes}" if self._before else "nothing of it is on disk"

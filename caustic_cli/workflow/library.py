@@ -134,7 +134,7 @@ def design_of(
         InputError, CausticError: as in `design`.
     """
     began, recorder = time.monotonic(), None if movie is None else Movie(movie, force)
-    project, first = workflow.begin(
+    begun = workflow.begin(
         Path(target) if isinstance(target, str) else target,
         given,
         preset=preset,
@@ -145,8 +145,8 @@ def design_of(
         say=say,
         device=device,
     )
-    compile_for(project.scene(), device, say, gradient=True)
-    return _lens(workflow.design(project, first, device, say, began, recorder), device)
+    compile_for(begun.scene, device, say, gradient=True)
+    return _lens(workflow.design(begun, device, say, began, recorder), device)
 
 
 def resume(

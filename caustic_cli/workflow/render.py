@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from caustic_cli.config.completion import filter_from
+from caustic_cli.config.design import filter_from
 from caustic_cli.config.tolerances import read as read_tolerances
 from caustic_cli.errors import InputError
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba

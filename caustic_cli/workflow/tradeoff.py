@@ -6,18 +6,16 @@ import copy
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
-import torch
-
 from caustic_cli.config import settings
-from caustic_cli.config.completion import build_options, build_stages, complete
+from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError
-from caustic_cli.inverse.designer import Designer, InitialHeights
+from caustic_cli.inverse.designer import Designer
 from caustic_cli.io.picture import Picture
+from caustic_cli.kinds import problem_of
 from caustic_cli.project.project import Project
 from caustic_cli.studies.efficiency import DesignedLens
 from caustic_cli.workflow.comparison import picture_of_disc
-from caustic_cli.workflow.design import first_heights
+from caustic_cli.workflow.design import Begun, first_heights
 
 #: Weights of the loss "light" relative to "rms", for distant sources, where thickness has no influence, and for near sources.
 DISTANT_WEIGHTS, NEAR_WEIGHTS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0), (0.0, 1.0, 10.0)
@@ -58,25 +56,31 @@ def _designed(project: Project | None, full: dict, weights, parts, seconds: floa
         own["design"]["waves"] = "off"
         own["design"]["stages"] = [s for s in own["design"]["stages"] if not s.get("waves")]
         try:
-            first, own, goal = _first(project, own)
+            begun = _begun(project, own, device)
         except CausticError:
             continue
-        scene = settings.build_scene(own)
+        problem = begun.problem
+        assert problem is not None
         for weight in weights:
             loss = f"rms + {weight:g} light" if weight else "rms"
-            options = replace(build_options(own), loss=loss, waves=False)
             try:
-                designer = Designer(scene, torch.from_numpy(goal), build_stages(own), options, device)
-                state = designer.run(designer.begin(*first or ()), time_limit=seconds)
+                designer = Designer(problem.varied(problem.stages, replace(problem.options, loss=loss, waves=False)))
+                state = designer.run(designer.begin(*begun.first or ()), time_limit=seconds)
             except CausticError:
                 continue
             yield DesignedLens(
-                thickness, weight, loss, scene, designer.field(state.stage), designer.within_limits(state), goal, state.seconds
+                thickness,
+                weight,
+                loss,
+                problem.scene,
+                designer.field(state.stage),
+                designer.within_limits(state),
+                problem.target.numpy(),
+                state.seconds,
             )
 
 
-def _first(project: Project | None, own: dict) -> tuple[InitialHeights | None, dict, np.ndarray]:
-    """Initial heights for settings, the settings adapted to them, and the target (n_x, n_y)."""
+def _begun(project: Project | None, own: dict, device: str) -> Begun:
+    """The design with these settings, adapted to its initial heights."""
     project = Project(None, own, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=own)
-    project, first = first_heights(project, {"lens": {"thickness": own["lens"]["thickness"]}})
-    return first, project.settings, project.target(project.scene())
+    return first_heights(project, {"lens": {"thickness": own["lens"]["thickness"]}}, problem_of(project, device))

@@ -1,0 +1,95 @@
+"""The [design] section and its stages, as the objects that a design runs with."""
+
+from __future__ import annotations
+
+import torch
+
+from caustic_cli.config.default_stages import Table, stage_base
+from caustic_cli.config.settings import Settings, build_screen, build_source, value_of
+from caustic_cli.config.table import check
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.constraints import Limits
+from caustic_cli.inverse.parametrisation import Architecture, Parametrisation
+from caustic_cli.inverse.problem import Options
+from caustic_cli.inverse.schedule import Rendering, Stage
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.scene import Screen
+
+
+def relative_to_initial(design: Table) -> bool:
+    """Whether the design uses a network whose outputs are relative to an initial surface."""
+    return design["network"] != "none" and design.get("preconditioner") == "laplacian"
+
+
+def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, per_pixel2: float | None = None) -> Filter:
+    """A reconstruction filter; the Gaussian's alpha in 1/mm^2 or 1/pixel^2 (default 1 per pixel^2)."""
+    if per_mm2 is not None and per_pixel2 is not None:
+        raise InputError("alpha_per_mm2 and alpha_per_pixel2 say the same thing twice: give one of them")
+    if kind == "bincount":
+        size = (1, 1)
+    alpha = (0.0, 0.0)
+    if kind == "gaussian":
+        if per_mm2 is not None:
+            alpha = per_mm2 * screen.pixel[0] * screen.pixel[0], per_mm2 * screen.pixel[1] * screen.pixel[1]
+        else:
+            alpha = (1.0 if per_pixel2 is None else per_pixel2,) * 2
+    return Filter(kind, tuple(size), alpha)
+
+
+def build_stages(settings: Settings) -> list[Stage]:
+    """The stages of complete settings.
+
+    Raises:
+        InputError: there are none, a value is out of range, or the last stage does not use the lens' control net.
+    """
+    stages = [stage_of(table, settings) for table in settings["design"].get("stages", [])]
+    if not stages:
+        raise InputError("[[design.stages]] at least one stage is needed")
+    if list(stages[-1].control) != list(settings["lens"]["control"]):
+        raise InputError(
+            f"[[design.stages]] the last stage's control {list(stages[-1].control)} must be the lens' own,"
+            f" {settings['lens']['control']}"
+        )
+    return stages
+
+
+def stage_of(table: Table, settings: Settings) -> Stage:
+    """The stage of a table of complete settings."""
+    t = stage_base(settings, "grid") | table
+    filter = filter_from(
+        t["reconstruction"], t["filter_size"], build_screen(settings), t.get("alpha_per_mm2"), t.get("alpha_per_pixel2")
+    )
+    source = build_source(settings, type=t["source"]) if "source" in t else None
+    return Stage(
+        tuple(t["control"]),
+        t["rays"],
+        t["sampler"],
+        Rendering(filter, t["blur"], t["apron"], t["oversample"], settings["design"]["filter_target"]),
+        t["iterations"],
+        t["tolerance"],
+        source,
+        tuple(t.get("waves", ())),
+        value_of(t, "design.stages.spread"),
+        value_of(t, "design.stages.lenslets"),
+    )
+
+
+def build_options(settings: Settings) -> Options:
+    """The design options of complete settings."""
+    d = settings["design"]
+    for key in ("dtype", "seed", "iterations"):
+        check(f"design.{key}", d[key])
+    for key in ("time_limit", "checkpoint_every"):  # which may be infinite
+        if not d[key] > 0:
+            raise InputError(f"⟨design.{key}⟩ must be greater than 0 s, got {d[key]:g}")
+    architecture = Architecture(*(value_of(d, f"design.{key}") for key in ("network_layers", "network_width", "activation")))
+    return Options(
+        d["loss"],
+        d["optimizer"],
+        d["lr"],
+        Parametrisation(d["network"], d["initial"], d["preconditioner"], architecture),
+        d["seed"],
+        getattr(torch, d["dtype"]),
+        Limits(d["max_slope"], d["min_radius"]),
+        d["waves"] == "on",
+    )

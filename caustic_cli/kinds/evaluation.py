@@ -1,0 +1,186 @@
+"""Judgement of a finished lens by independent rays, and by the wave image if that was refined, against the initial one.
+
+The loss of the optimiser does not qualify: it overfits its own rays and reconstruction filter.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.loss_terms import parse
+from caustic_cli.optics.image import Image
+from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.system import trace_arguments
+from caustic_cli.optics.waves import WaveImage
+from caustic_cli.studies.metrics import judged
+from caustic_cli.studies.retrace import RELATIVE_NOISE, evaluation_rays, retrace
+from caustic_cli.studies.waves import unseen_figures, wave_figures
+
+if TYPE_CHECKING:
+    from caustic_cli.kinds.surface import OneSurface
+
+#: Losses that measure the error of the picture alone; others may increase it in exchange for another objective.
+LIKENESS = {"rms", "rms-light", "throughput"}
+#: Ratio of the light on the screen from which a lens is kept although the initial surface has a smaller error.
+BRIGHTER = 1.01
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """Result of the evaluation of a design."""
+
+    #: With the lens that was kept.
+    state: State
+    #: Of the JSON table, with start_error, its judged error, and start_relative_rms if the initial surface was retraced.
+    figures: dict[str, Any]
+    #: Power per pixel on the screen by rays, (n_x, n_y) or (3, n_x, n_y), float64.
+    image: np.ndarray
+    #: The same by waves, None if that was not refined.
+    waves: np.ndarray | None = None
+    #: The image on a screen farther away and its target, (k_x, k_y) each, or None.
+    farther: tuple[np.ndarray, np.ndarray] | None = None
+
+
+class Seen(NamedTuple):
+    """A retraced lens: its ray image, wave image if refined, and figures."""
+
+    exposure: Image
+    light: WaveImage | None
+    figures: dict[str, Any]
+
+
+class Judge:
+    """Figures of a finished lens, and the lens that is kept; see `OneSurface.evaluate`."""
+
+    def __init__(self, problem: OneSurface, designer: Designer, state: State, size: tuple[float, float], timed: bool):
+        self.problem, self.designer, self.state, self.timed = problem, designer, state, timed
+        self.field = designer.field(state.stage)
+        self.refined = any(s.waves for s in designer.stages[: state.stage + 1])
+        self.seen = Resolution.before(problem.scene, size)
+        self.target = problem.target.numpy()
+        self.start: dict[str, Any] | None = None  # figures of the initial surface
+        self.exposure, self.light, self.figures = self.see(state.heights)
+
+    def rays(self, heights: Tensor, noise: bool = True) -> tuple[Image, dict[str, Any]]:
+        """Image and figures by independent rays."""
+        scene = self.problem.scene
+        return retrace(
+            *trace_arguments(scene, self.field, heights),
+            self.target,
+            rays=evaluation_rays(scene, self.problem.final_rays),
+            device=self.problem.device,
+            seed=self.problem.options.seed,
+            noise=noise,
+            quiet=None if self.timed else RELATIVE_NOISE,
+        )
+
+    def see(self, heights: Tensor, noise: bool = True) -> Seen:
+        """The same, and by waves if these were refined."""
+        exposure, figures = self.rays(heights, noise)
+        if not self.refined:
+            return Seen(exposure, None, figures)
+        problem = self.problem
+        light, more = wave_figures(
+            problem.scene, self.field, heights.to(problem.device), self.target, self.seen, required=problem.options.waves
+        )
+        return Seen(exposure, light, figures | more)
+
+    def compare_with_start(self) -> None:
+        """Keep the initial surface if it is better, where the loss measures the error of the picture alone."""
+        problem, state = self.problem, self.state
+        by_likeness = {name for _, name in parse(problem.options.loss)} <= LIKENESS
+        if state.start is None or not (by_likeness and problem.one_scene):
+            return
+        heights = problem.feasible(state.stage, self.designer.begun(state))
+        # other light has an estimate of the noise anyway
+        _, light, began = self.see(heights, noise=not problem.scene.source.collimated or state.unrounded is not None)
+        figures = self.figures
+        if _worse(figures, began):
+            why = f"its start was better and is kept: {_difference(figures, began)}"
+            self.state = replace(self.designer.showing(state, heights), reason=f"{state.reason}; {why}")
+            self.exposure, retraced = self.rays(heights)
+            figures, self.light = began | retraced, light
+        elif began["on_screen"] > 0:
+            likeness, light_of = _keys(figures, began)
+            if figures[likeness] > began[likeness]:
+                brighter = figures[light_of] / began[light_of] - 1.0
+                why = f"its start was more like the picture, this lens is {brighter:.1%} brighter: {_difference(figures, began)}"
+                self.state = replace(state, reason=f"{state.reason}; {why}")
+        self.start = began
+        self.figures = figures | {"start_error": judged(began, self.refined)["error"], "start_relative_rms": began["relative_rms"]}
+        if began["noise"] is not None:
+            self.figures |= {"start_noise": began["noise"]}
+        if self.refined:
+            self.figures |= {"start_wave_relative_rms": began["wave_relative_rms"]}
+
+    def compare_unrounded(self) -> None:
+        """Add the cost of a least radius, if there is one."""
+        state, problem = self.state, self.problem
+        if state.unrounded is None:
+            return
+        rounded = self.start or self.rays(problem.feasible(state.stage, self.designer.begun(state)))[1]
+        unrounded = self.rays(self.designer.begun(state, rounded=False))[1]
+        self.figures |= {"min_radius": radius_figures(problem.options.limits.min_radius, rounded, unrounded)}
+
+    def add_unseen(self) -> None:
+        """Add the error of the wave image at wavelengths that were not refined."""
+        if self.light is not None:
+            heights = self.state.heights.to(self.problem.device)
+            self.figures |= unseen_figures(self.problem.scene, self.field, heights, self.target)
+
+    def found(self) -> Evaluated:
+        """The result."""
+        light = None if self.light is None else self.light.image.cpu().numpy()
+        return Evaluated(self.state, judged(self.figures, self.refined), self.exposure.image.cpu().numpy(), light)
+
+
+def radius_figures(radius: float, rounded: dict, unrounded: dict) -> dict[str, float | None]:
+    """Cost of a least radius of concave regions: light in black regions for the initial surface, with the limit and without.
+
+    Args:
+        radius: mm; rounded, unrounded: figures of that surface, with the same rays, within all limits and within all but the
+            radius.
+
+    Returns:
+        radius_mm; start_in_black and start_in_black_without, fractions of the light on the screen; in_black_per_mm, their
+        difference over the radius, and its noise; None if the picture has no black region.
+    """
+    one, other = rounded["in_black"], unrounded["in_black"]
+    noises = rounded["in_black_noise"], unrounded["in_black_noise"]
+    return {
+        "radius_mm": radius,
+        "start_in_black": one,
+        "start_in_black_without": other,
+        "in_black_per_mm": None if one is None or other is None else (one - other) / radius,
+        "noise": None if None in noises else math.hypot(*noises) / radius,
+    }
+
+
+def _keys(figures: dict, than: dict) -> tuple[str, str]:
+    """Names of the figures by which two lenses are compared, error and light: those of the wave image if both have one."""
+    as_waves = None not in (f.get("wave_relative_rms") for f in (figures, than))
+    return ("wave_relative_rms", "wave_on_screen") if as_waves else ("relative_rms", "on_screen")
+
+
+def _difference(figures: dict, start: dict) -> str:
+    """By which figures a lens and its initial surface differ, as a clause."""
+    likeness, light = _keys(figures, start)
+    by = "waves" if likeness.startswith("wave") else "rays"
+    return (
+        f"relative RMS error by {by} {start[likeness]:.4f}, after the iterations {figures[likeness]:.4f},"
+        f" with {start[light]:.2%} and {figures[light]:.2%} of the light on the screen"
+    )
+
+
+def _worse(figures: dict, than: dict) -> bool:
+    """Whether a picture has a larger error without being brighter; a black one is worse than any other."""
+    if than["on_screen"] == 0:
+        return False
+    likeness, light = _keys(figures, than)
+    return figures["on_screen"] == 0 or (figures[likeness] > than[likeness] and figures[light] < BRIGHTER * than[light])

@@ -1,0 +1,133 @@
+"""A flat plate whose refractive index is designed, evaluated like any lens.
+
+The control values of the index are a file of the project, which [lens] index_file names; the checkpoint holds the flat exit.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from caustic_cli.config.default_stages import refinement, transport_cells
+from caustic_cli.config.settings import Settings, value_of
+from caustic_cli.config.table import check, default
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.designer import State
+from caustic_cli.inverse.gradient_index import design_gradient_index
+from caustic_cli.kinds.defaults import Defaults
+from caustic_cli.kinds.surface import OneSurface
+
+RAYS_BENT = 16  # largest number of rays per pixel, since they cost more
+
+
+class IndexPlate(OneSurface):
+    """A plate with a designed index; its surface is flat."""
+
+    no_movie = "⟨movie⟩ records the design of a surface; ⟨lens.gradient⟩ free designs the index"
+    no_resume = "⟨lens.gradient⟩ free cannot be resumed: design it anew, with more ⟨iterations⟩"
+    in_stages = False
+
+    @classmethod
+    def applies(cls, s: Settings) -> bool:
+        return s["lens"].get("gradient") == "free"
+
+    @classmethod
+    def complete(cls, d: Defaults) -> None:
+        """L-BFGS from optimal transport, on rays."""
+        s, lens, design = d.s, d.lens, d.design
+        if not d.source.collimated:
+            raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
+        if max(value_of(lens, "lens.array")) > 1:
+            raise InputError("⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat")
+        if value_of(s["target"], "target.color"):
+            raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
+        if robust := design.get("robust"):
+            raise InputError(
+                f"⟨design.robust⟩ {robust} averages over errors of a designed surface, but ⟨lens.gradient⟩ free designs the index"
+            )
+        if design.setdefault("start", "offset") not in ("offset", "transport"):
+            raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design['start']}")
+        for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
+            if design[key] != only:
+                raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
+        if check("design.waves", design["waves"]) == "on":
+            raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
+        design["start"] = "offset"  # of the surface, which is flat; the index starts from optimal transport
+        design.setdefault("preconditioner", "laplacian")
+        if "stages" not in design:
+            last = refinement(tuple(lens["control"]), d.rays, d.resolution, d.quality)[-1]
+            design["stages"] = [last | {"rays": d.rays or min(last["rays"], RAYS_BENT * math.prod(d.resolution))}]
+
+    def iterate(
+        self,
+        lens: dict[str, Any],
+        iterations: int,
+        began: float,
+        time_limit: float,
+        stop: Callable[[], bool],
+        show: Callable[..., None],
+    ) -> tuple[np.ndarray, State]:
+        """Design the index of the plate: its control values, and the final state.
+
+        Args:
+            lens: the [lens] section; iterations: in total, 0 for those of the stage.
+            began: start of the command by `time.monotonic`; time_limit: of the command, s, of which two thirds are for the
+                iterations and the rest for the evaluation.
+            stop: called before every iteration; show: progress.
+
+        Raises:
+            InputError: as of `design_gradient_index`.
+        """
+        stage, target = self.stages[-1], self.target.numpy()
+        total = iterations or stage.iterations
+        limit = time_limit if math.isinf(time_limit) else 2.0 * time_limit / 3.0
+        rows: list[tuple[int, int, float, float, float]] = []
+
+        def late() -> bool:
+            return time.monotonic() - began > limit
+
+        def on_iteration(k: int, loss: float, on_screen: float, _image: Any) -> None:
+            rows.append((k, 0, loss, on_screen, time.monotonic() - began))
+            show("index", f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", k, total)
+
+        blank = replace(self.scene, lens=replace(self.scene.lens, gradient=None))
+        found = design_gradient_index(
+            blank,
+            target,
+            tuple(lens["index_control"]),
+            value_of(lens, "lens.index_layers"),
+            tuple(lens["index_range"]),
+            cells=transport_cells(stage.rays, False),
+            iterations=total,
+            rays=stage.rays,
+            seed=self.options.seed,
+            on_iteration=on_iteration,
+            stop=lambda: stop() or late(),
+        )
+        done = len(rows)
+        reason = (
+            "interrupted"
+            if stop()
+            else "time limit"
+            if late() and done < total
+            else "iterations"
+            if done == total
+            else "no progress"
+        )
+        flat = torch.full(tuple(lens["control"]), float(self.scene.lens.offset.thickness), dtype=torch.float64)
+        seconds = rows[-1][-1] if rows else 0.0
+        state = State(flat, iteration=done, total=done, history=rows, seconds=seconds, reason=reason)
+        return found.index.coefficients.numpy(), state
+
+    def words(self, lens: dict[str, Any]) -> str:
+        """What is designed, before it is."""
+        return (
+            f"index: {lens['index_control'][0]} x {lens['index_control'][1]} x {value_of(lens, 'lens.index_layers')} control values"
+            f" of {lens['index_range'][0]:.4g} to {lens['index_range'][1]:.4g}, {self.stages[-1].rays:,} rays"
+        )

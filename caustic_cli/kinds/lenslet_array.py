@@ -1,0 +1,104 @@
+"""An array of lenslets, which all throw the picture, or one of a sheet each, onto the same screen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.config.default_stages import Table, each_lenslet
+from caustic_cli.config.settings import Settings, value_of
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.initial_surface import InitialSurface
+from caustic_cli.inverse.lenslets import NEEDS_DISTANT_SOURCE, array_objective, initial_array, lenslets
+from caustic_cli.inverse.problem import LossOfHeights
+from caustic_cli.inverse.target import grey
+from caustic_cli.kinds.defaults import Defaults
+from caustic_cli.kinds.surface import Described, OneSurface
+from caustic_cli.scene import Scene
+from caustic_cli.scene.lens import array_control
+
+#: Least number of source cells along a lenslet.
+LEAST_CELLS = 128
+
+
+class LensletArray(OneSurface):
+    """An array of lenslets.
+
+    Args:
+        own: (n_x, n_y) targets of the lenslets, j fastest; one for all is `target`.
+    """
+
+    def __init__(self, *args: Any, own: Sequence[Tensor] = (), **more: Any):
+        self.own = list(own)
+        super().__init__(*args, **more)
+
+    @classmethod
+    def applies(cls, s: Settings) -> bool:
+        return max(value_of(s["lens"], "lens.array")) > 1
+
+    @classmethod
+    def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
+        own = [torch.from_numpy(one) for one in described.targets(scene)]
+        return {"own": own if len(own) > 1 else []} | super().further(described, scene)
+
+    @classmethod
+    def refuse_settings(cls, d: Defaults) -> None:
+        super().refuse_settings(d)
+        if d.design["start"] == "offset" or not d.plain:
+            raise InputError(
+                "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none"
+                " and optimizer lbfgs"
+            )
+        if d.design["start"] == "transport" and not d.source.distant:
+            raise InputError(NEEDS_DISTANT_SOURCE)
+
+    @classmethod
+    def fine_net(cls, d: Defaults) -> bool:
+        return True  # lenslets need a transport start
+
+    @classmethod
+    def exact_start(cls, d: Defaults) -> bool:
+        return d.plain and d.design["start"] != "offset"
+
+    @classmethod
+    def complete_control(cls, d: Defaults) -> None:
+        super().complete_control(d)
+        control = d.lens["control"]
+        fits = [
+            array_control(n, p, k) if k > 1 else n
+            for n, p, k in zip(control, d.lens["degree"], value_of(d.lens, "lens.array"), strict=True)
+        ]
+        if d.own_control and fits != list(control):
+            raise InputError(
+                "⟨lens.control⟩ of an array must be lenslets times (spans + degree - 1) and one more along each axis, such as"
+                f" {fits[0]} x {fits[1]}, got {control[0]} x {control[1]}"
+            )
+        d.lens["control"] = fits
+
+    @classmethod
+    def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
+        stages = cls.refinement(d)
+        if value_of(d.s["target"], "target.sheet"):
+            stages = each_lenslet(stages, math.prod(value_of(d.lens, "lens.array")), d.resolution)
+        return stages
+
+    def takes_lenslets(self, k: int) -> bool:
+        return not (self.stages[k].waves or self.stages[k].spread)
+
+    def objective_in(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
+        stage = self.stages[k]
+        if not stage.lenslets:
+            return super().objective_in(scene, k, begun)
+        parts = lenslets(self.lit(scene, k), stage.control)
+        own, rays = self.own or [self.target] * len(parts), max(1, stage.rays // len(parts))
+        return array_objective(parts, lambda n, lenslet: self.on_rays(lenslet.scene, k, lenslet.field, own[n], rays))
+
+    def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
+        goals = [grey(own.numpy()) for own in self.own] or [goal]
+        cells = max(LEAST_CELLS, cells // max(scene.lens.array))
+        return InitialSurface(initial_array(scene, goals, self.stages[0].control, cells).heights)

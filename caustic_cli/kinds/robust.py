@@ -1,0 +1,53 @@
+"""A robust design: the loss of the last stage is a mean over manufacturing and alignment errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from caustic_cli.config.settings import Settings
+from caustic_cli.inverse.problem import LossOfHeights
+from caustic_cli.inverse.robust import robust_objective
+from caustic_cli.kinds.lenslet_array import LensletArray
+from caustic_cli.kinds.surface import Described, OneSurface
+from caustic_cli.scene import Scene
+from caustic_cli.scene.sources.section import content
+from caustic_cli.scene.tolerances import Tolerances
+
+
+def _tolerances(s: Settings) -> Tolerances | None:
+    return content(s["design"], "robust", Tolerances)
+
+
+class RobustSurface(OneSurface):
+    """One surface, robust.
+
+    Args:
+        tolerances: the errors.
+    """
+
+    one_scene = False
+
+    def __init__(self, *args: Any, tolerances: Tolerances, **more: Any):
+        self.tolerances = tolerances
+        super().__init__(*args, **more)
+
+    @classmethod
+    def applies(cls, s: Settings) -> bool:
+        return _tolerances(s) is not None and super().applies(s)
+
+    @classmethod
+    def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
+        return {"tolerances": _tolerances(described.settings)} | super().further(described, scene)
+
+    def objective(self, k: int, begun: Tensor) -> LossOfHeights:
+        if k < len(self.stages) - 1:
+            return super().objective(k, begun)
+        return robust_objective(
+            lambda scene, heights: self.objective_in(scene, k, heights), self.scene, self.field(k), begun, self.tolerances
+        )
+
+
+class RobustArray(RobustSurface, LensletArray):
+    """An array of lenslets, robust."""

@@ -1,0 +1,436 @@
+"""A single free-form surface, the lens' exit: the kind of which all others are made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.config.default_stages import (
+    GAPS,
+    Table,
+    coarse_to_fine,
+    creased_control,
+    on_rays,
+    refinement,
+    refinement_spans,
+    transport_cells,
+)
+from caustic_cli.config.design import build_options, build_stages, relative_to_initial
+from caustic_cli.config.settings import Settings, build_screen
+from caustic_cli.config.table import check, default
+from caustic_cli.config.wave_stages import wave_stages
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
+from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
+from caustic_cli.inverse.objective import Objective, SourceBlur
+from caustic_cli.inverse.optimisers import Adam, QuasiNewton
+from caustic_cli.inverse.parametrisation import FreeHeights, Heights
+from caustic_cli.inverse.problem import LossOfHeights, Problem, Skipped
+from caustic_cli.inverse.reachability import refuse_unreachable
+from caustic_cli.inverse.sharpness import advice
+from caustic_cli.inverse.source_limits import (
+    SourceLimits,
+    best_irradiance,
+    performance_limits,
+    point_source,
+    regular_rays,
+    source_spread,
+)
+from caustic_cli.inverse.target import grey
+from caustic_cli.inverse.waves import WaveObjective
+from caustic_cli.kinds.defaults import Defaults
+from caustic_cli.kinds.evaluation import Evaluated, Judge
+from caustic_cli.optics.emission.measured import coarse_words
+from caustic_cli.optics.obstruction import refuse_obstructed
+from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.system import trace_arguments
+from caustic_cli.optics.waves import NoWaveImage
+from caustic_cli.scene import Scene
+from caustic_cli.studies.manufacture import preview
+from caustic_cli.studies.retrace import FINAL_RAYS, retrace
+
+DEFAULT_SPANS = 128  # knot spans of the final net; divisible by 2 through the stages
+NETWORK_CONTROL = 50  # table D.2
+
+
+class Described(Protocol):
+    """What a problem is made from, such as a project."""
+
+    settings: Settings
+
+    def scene(self) -> Scene:
+        """The complete scene."""
+
+    def target(self, scene: Scene) -> np.ndarray:
+        """The target on its screen, (n_x, n_y), or (3, n_x, n_y) in colour."""
+
+    def targets(self, scene: Scene) -> list[np.ndarray]:
+        """The target of each lenslet there, j fastest; a single one for a common picture."""
+
+    def second_target(self, scene: Scene) -> np.ndarray | None:
+        """The second target on its screen, or None."""
+
+
+class OneSurface(Problem):
+    """One free-form surface, on rays and on the wave image, under any source."""
+
+    #: Why the optimisation cannot be recorded or resumed; "" where it can.
+    no_movie = no_resume = ""
+    #: Whether the optimisation is that of the stage loop; otherwise the kind brings its own, `iterate`.
+    in_stages = True
+    #: Whether the thickness and the range of the heights may be adapted to the initial surface.
+    adapts = True
+
+    # Settings
+
+    @classmethod
+    def applies(cls, s: Settings) -> bool:
+        """Whether a design with these settings is of this kind."""
+        return True
+
+    @classmethod
+    def of(cls, described: Described, device: str = "cpu") -> OneSurface:
+        """The problem of a project."""
+        scene, s = described.scene(), described.settings
+        target = torch.from_numpy(described.target(scene))
+        return cls(scene, target, build_stages(s), build_options(s), device, **cls.further(described, scene))
+
+    @classmethod
+    def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
+        """Further arguments of the constructor."""
+        return {}
+
+    @classmethod
+    def complete(cls, d: Defaults) -> None:
+        """Complete [design], its stages and the control net.
+
+        Raises:
+            InputError: a value is out of range, or two contradict each other.
+        """
+        asked = check("design.waves", d.design["waves"])
+        d.design.setdefault("start", cls.default_start(d))
+        cls.refuse_settings(d)
+        cls.complete_control(d)
+        d.design.setdefault("preconditioner", "laplacian" if d.plain else "none")
+        if d.complete_given_stages():
+            if asked != "auto" and any(stage.get("waves") for stage in d.design["stages"]) != (asked == "on"):
+                raise InputError(
+                    f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
+                    + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves")
+                )
+            return
+        waves = wave_stages(d.s, d.source, d.quality, d.lit)
+        stages = cls.default_stages(d, waves) + waves
+        if d.design["loss"].strip() == "rms":  # eq. 5.2.1 is defined on the screen only
+            stages = [stage | {"apron": 0} for stage in stages]
+        d.design["stages"] = stages
+
+    @classmethod
+    def default_start(cls, d: Defaults) -> str:
+        """The initial surface unless one is given."""
+        return "transport" if d.from_surface and cls.fine_net(d) and not d.source.apart else "offset"
+
+    @classmethod
+    def refuse_settings(cls, d: Defaults) -> None:
+        """Refuse contradictions of the settings.
+
+        Raises:
+            InputError: there is one.
+        """
+        if d.design["start"] != "offset" and d.trained and not relative_to_initial(d.design):
+            raise InputError(
+                f"⟨design.start⟩ {d.design['start']} gives a surface, from which a network can start only with"
+                " ⟨+design.preconditioner⟩ laplacian; use that, start offset, or network none"
+            )
+
+    @classmethod
+    def fine_net(cls, d: Defaults) -> bool:
+        """Whether the control net resolves an initial surface by transport."""
+        return d.fine_net
+
+    @classmethod
+    def spread(cls, d: Defaults) -> bool:
+        """Whether the image of the source's centre is to be convolved with that of the source."""
+        return d.plain and cls.fine_net(d) and not d.source.sharp and d.shifts
+
+    @classmethod
+    def exact_start(cls, d: Defaults) -> bool:
+        """Whether the initial surface is accurate at every scale: by transport, for a point source or plane wave, if the net
+        resolves it, and for an extended source that shifts the image, apart from its blur.  Otherwise stages are coarse to fine."""
+        return d.plain and cls.fine_net(d) and d.design["start"] != "offset" and (d.source.sharp or cls.spread(d))
+
+    @classmethod
+    def complete_control(cls, d: Defaults) -> None:
+        """Complete the control net."""
+        if not d.own_control:
+            d.lens["control"] = cls.default_control(d)
+
+    @classmethod
+    def default_control(cls, d: Defaults) -> list[int]:
+        """The control net unless one is given."""
+        if d.trained:
+            return [NETWORK_CONTROL] * 2
+        spans = refinement_spans(max(d.resolution), d.quality) if cls.exact_start(d) else DEFAULT_SPANS
+        return [spans + p for p in d.lens["degree"]]
+
+    @classmethod
+    def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
+        """The stages on rays unless they are given; waves: those on the wave image that follow."""
+        lens = d.lens
+        if cls.exact_start(d):
+            return cls.refinement(d, cls.creased(d, waves))
+        if d.plain and "knots_u" not in lens:
+            return coarse_to_fine(tuple(lens["control"]), lens["degree"], d.sampled, d.resolution, d.quality, sampler=d.sampler)
+        return [
+            on_rays(
+                lens["control"],
+                d.sampled,
+                d.sampler,
+                apron=math.ceil(0.04 * max(d.resolution)),
+                iterations=default("design.stages.iterations"),
+                tolerance=2e-3 if d.plain else 0.0,
+            )
+        ]
+
+    @classmethod
+    def creased(cls, d: Defaults, waves: list[Table]) -> bool:
+        """Whether the picture has dark gaps, for whose creases the control net is then made fine.
+
+        Diffraction smooths creases more than a coarser net, and the pixels of a tilted screen do not coincide with those that the
+        map is solved for, which shows as lines: a flame at 30 degrees has an error of 0.205 on the finer net and 0.087 without.
+        """
+        aligned = d.source.distant and build_screen(d.s).upright
+        creased = d.gaps >= GAPS and not (d.own_control or waves or cls.spread(d)) and aligned
+        if creased:
+            d.lens["control"] = [creased_control(max(d.resolution), p, d.quality) for p in d.lens["degree"]]
+        return creased
+
+    @classmethod
+    def refinement(cls, d: Defaults, creased: bool = False) -> list[Table]:
+        """The stages after a transport start."""
+        spread = cls.spread(d)
+        centre = d.source.pointlike() if spread else d.source
+        control = tuple(d.lens["control"])
+        return refinement(control, d.rays, d.resolution, d.quality, not centre.collimated, spread, creased)
+
+    # Numerics
+
+    def check(self) -> None:
+        super().check()
+        if any(stage.lenslets and not self.takes_lenslets(k) for k, stage in enumerate(self.stages)):
+            raise InputError("⟨design.stages.lenslets⟩ needs ⟨lens.array⟩, and neither waves nor spread in the same stage")
+        if not self.options.parametrisation.free and any(s.waves for s in self.stages):
+            raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
+
+    def takes_lenslets(self, k: int) -> bool:
+        """Whether stage k can compare each lenslet with its own target."""
+        return False
+
+    def parametrised(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
+        if self.stages[k].waves:
+            return FreeHeights(*self.bounds(k), start, counted=True)
+        return super().parametrised(k, start, loaded)
+
+    def carries_parameters(self, k: int) -> bool:
+        by_rays = not (self.stages[k].waves or self.stages[k - 1].waves)
+        return super().carries_parameters(k) and (by_rays or not self.options.parametrisation.free)
+
+    def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
+        return QuasiNewton if self.stages[k].waves else super().optimiser(k)
+
+    def objective_in(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
+        stage = self.stages[k]
+        if stage.waves:
+            return self.on_waves(self.lit(scene, k), k, begun)
+        if stage.spread and (found := self.on_spread(self.lit(scene, k), k, begun)) is not None:
+            return found
+        return super().objective_in(scene, k, begun)
+
+    def on_waves(self, scene: Scene, k: int, begun: Tensor) -> WaveObjective:
+        """The objective of stage k on the wave image.
+
+        Raises:
+            Skipped: there is none, and it is not asked for; else NoWaveImage.
+        """
+        stage, o = self.stages[k], self.options
+        try:
+            return WaveObjective(
+                scene,
+                self.field(k),
+                begun,
+                self.target,
+                o.loss,
+                stage.rendering,
+                o.limits,
+                wavelengths=stage.waves,
+                dtype=o.dtype,
+                device=self.device,
+            )
+        except NoWaveImage as error:
+            if o.waves:
+                raise
+            raise Skipped(f"the wave image is not refined: {error}", "no wave image") from error
+
+    def on_spread(self, scene: Scene, k: int, begun: Tensor) -> Objective | None:
+        """The objective of stage k on the image of the source's centre, convolved with that of the source; None where this is no
+        good approximation."""
+        stage, o, field = self.stages[k], self.options, self.field(k)
+        if (spread := source_spread(scene, field, begun)) is None:
+            return None
+        expected = best_irradiance(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
+        scene, rays, spreads = regular_rays(scene, spread, stage, self.seed(k), self.device)
+        blur = SourceBlur(spreads, expected)
+        return Objective(scene, field, rays, self.target, o.loss, stage.rendering, o.limits, blur=blur, dtype=o.dtype)
+
+    # Initial surface
+
+    def refuse_unreachable(self) -> None:
+        """Refuse a picture out of reach, before any work.
+
+        Raises:
+            InputError: the screen is obstructed, or the picture cannot be reached by refraction.
+        """
+        for scene in self.scenes:
+            refuse_unreachable(scene, grey(self.target.numpy()))
+
+    def refuse_obstructed(self) -> None:
+        """Refuse a screen that is in the light of its source.
+
+        Raises:
+            InputError: it is.
+        """
+        for scene in self.scenes:
+            refuse_obstructed(scene)
+
+    def offset(self) -> Tensor | None:
+        """Heights (n, m) mm of the offset surface with the slope that turns its light to the centre of a shifted screen; None for
+        one that is not shifted, or for a network, whose heights are relative to the offset surface."""
+        shift = self.scene.screen.shift
+        if not (any(shift) and self.options.parametrisation.free):
+            return None
+        lens = self.scene.lens
+        x, y = (c.numpy() for c in self.field(0).control_xy())
+        slope = [c / ((lens.effective_index - 1.0) * (self.scene.screen.z - lens.offset.thickness)) for c in shift]
+        return torch.from_numpy(lens.offset.heights(x, y) + slope[0] * x[:, None] + slope[1] * y[None, :])
+
+    def transport(self, fixed: bool, seconds: float) -> InitialSurface:
+        """Initial heights by transport on the control net of the first stage.
+
+        fixed: the thickness is given by the user; a surface below the least thickness is raised, which leaves slopes unchanged.
+        seconds: approximate time allowed for a near source.
+
+        Raises:
+            InputError: the picture cannot be reached.
+        """
+        scene, goal, first = self.scene, grey(self.target.numpy()), self.stages[0]
+        spans = min(n - p for n, p in zip(first.control, scene.lens.degree, strict=True))
+        cells = transport_cells(max(s.rays for s in self.stages), not scene.source.collimated, spans)
+        spread = source_spread(scene) if first.spread else None
+        if spread is not None:
+            light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
+            scene, goal = replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
+        found, lens = self.solved(scene, goal, cells, fixed, seconds), self.scene.lens
+        short = lens.z_in + lens.min_thickness - float(found.heights.min())
+        return replace(found, heights=found.heights + 1.01 * short) if fixed and short > 0 else found
+
+    def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
+        """`transport` of the light of a scene to an irradiance on its screen, with this number of source cells."""
+        return first_surface(scene, goal, self.field(0), cells, fixed, seconds)
+
+    # Messages
+
+    def notes(self, size: tuple[float, float], timed: bool, without_waves: str) -> Iterator[str]:
+        """What is to be said of the limits set by source and diffraction before the design.
+
+        size: of the picture, mm; timed: under a time limit; without_waves: why `waves = "auto"` leaves out the wave image.
+        """
+        if coarse := coarse_words(self.scene):
+            yield coarse
+        seen = Resolution.before(self.scene, size)
+        yield from self.resolution_notes(seen)
+        if words := self.source_limits(SMOOTH_STEPS if timed else None).sentence():
+            yield words
+        if seen.matters and without_waves and self.refines_waves:
+            yield f"the wave image is not refined: {without_waves}"
+
+    #: Whether the wave image can be refined at all.
+    refines_waves = True
+
+    def resolution_notes(self, seen: Resolution) -> Iterator[str]:
+        """What is to be said of the resolution before the design."""
+        yield seen.sentence()
+
+    def preview(self, heights: Tensor, size: int) -> Iterator[str]:
+        """What is to be said of an initial surface; size: expected bytes of its file."""
+        yield preview(self.scene, self.field(0), heights, size)
+
+    def advice(self, size: tuple[float, float]) -> str:
+        """A recommendation after the design, or "".
+
+        size: of the picture, mm.
+        """
+        return advice(self.scene, grey(self.target.numpy()), size)
+
+    # Evaluation
+
+    #: Whether the loss is that of one scene, so that a lens can be compared with the initial one by the picture there.
+    one_scene = True
+
+    @cached_property
+    def _limits(self) -> dict[int | None, SourceLimits]:
+        return {}
+
+    def source_limits(self, steps: int | None = None) -> SourceLimits:
+        """The limits set by the source, which are the same for any lens: computed once; steps: as of `performance_limits`."""
+        if steps not in self._limits:
+            self._limits[steps] = performance_limits(self.scene, self.target.cpu().numpy(), steps)
+        return self._limits[steps]
+
+    #: Rays of an evaluation.
+    final_rays = FINAL_RAYS
+    #: Retraces of an evaluation beyond those of one scene, in the time of one.
+    further_retraces = 0.0
+
+    def evaluate(self, designer: Designer, state: State, size: tuple[float, float], timed: bool = False) -> Evaluated:
+        """Retrace the finished lens with independent rays, and compute its wave image if that was refined.
+
+        If the loss measures the error of the picture alone, a lens that is worse than the initial one is replaced by it; they are
+        compared by the wave image if that was refined.
+
+        Args:
+            size: width and height of the picture, mm; timed: under a time limit, do not increase the number of rays, and limit the
+                iterations for the least error.
+        """
+        judge = Judge(self, designer, state, size, timed)
+        judge.compare_with_start()
+        judge.compare_unrounded()
+        bounds = self.source_limits(SMOOTH_STEPS if timed else None)
+        judge.figures |= {
+            key: bound
+            for key, bound in (("least_relative_rms", bounds.error), ("etendue_limit", bounds.etendue))
+            if bound is not None
+        }
+        judge.add_unseen()
+        judge.figures |= self.further_figures(designer, judge.state)
+        return judge.found()
+
+    def errors(self, designer: Designer, state: State, rays: int, seed: int, middle: bool = True) -> list[dict[str, Any]]:
+        """Figures of the lens with independent rays, a row for each scene that it is for.
+
+        Raises:
+            CausticError: no light reaches the screen.
+        """
+        found = trace_arguments(self.scene, designer.field(state.stage), state.heights)
+        return [retrace(*found, self.target.numpy(), rays=rays, seed=seed, device=self.device)[1]]
+
+    def further_figures(self, designer: Designer, state: State) -> dict[str, Any]:
+        """Figures beyond those of any kind."""
+        return {}

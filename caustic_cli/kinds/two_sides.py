@@ -1,0 +1,135 @@
+"""A lens with two free-form sides: a picture, and a second one or the directions of the light behind it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.config.default_stages import TWO_SIDED_SPANS, refinement_spans, two_sided
+from caustic_cli.config.settings import Settings
+from caustic_cli.config.table import check
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.initial_surface import InitialSurface
+from caustic_cli.inverse.initial_two_sided import first_sides
+from caustic_cli.inverse.internal_rays import entrance_points
+from caustic_cli.inverse.parametrisation import Heights, SidesTogether
+from caustic_cli.inverse.problem import LossOfHeights
+from caustic_cli.inverse.target import grey
+from caustic_cli.inverse.two_sided import TwoSidedObjective
+from caustic_cli.kinds.defaults import Defaults
+from caustic_cli.kinds.evaluation import Evaluated, radius_figures
+from caustic_cli.kinds.several_surfaces import SeveralSurfaces
+from caustic_cli.kinds.surface import Described
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.system import split_heights
+from caustic_cli.scene import Scene
+from caustic_cli.studies.metrics import judged
+from caustic_cli.studies.retrace import retrace
+from caustic_cli.studies.second_target import second_figures
+
+#: Divisor of the rays for the initial surfaces.
+STARTS = 4
+
+
+class TwoSides(SeveralSurfaces):
+    """Entrance and exit.
+
+    Args:
+        second: (k_x, k_y) irradiance on the scene's second screen, where it has one.
+    """
+
+    adapts = False
+
+    def __init__(self, *args: Any, second: Tensor | None = None, **more: Any):
+        self.second = second
+        super().__init__(*args, **more)
+
+    @classmethod
+    def applies(cls, s: Settings) -> bool:
+        return "second" in s
+
+    @classmethod
+    def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
+        second = described.second_target(scene)
+        return {"second": None if second is None else torch.from_numpy(second)}
+
+    @classmethod
+    def complete(cls, d: Defaults) -> None:
+        design, asked = d.design, check("design.waves", d.design["waves"])
+        if design.setdefault("start", "transport") != "transport":
+            raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {design['start']}")
+        if asked == "on":
+            raise InputError("⟨design.waves⟩ on: two free-form sides are refined by rays alone")
+        cls.complete_control(d)
+        design.setdefault("preconditioner", "laplacian")
+        if not d.complete_given_stages():
+            design["stages"] = two_sided(tuple(d.lens["control"]), d.rays, d.resolution, d.quality)
+        elif any(stage.get(key) for stage in design["stages"] for key in ("waves", "spread")):
+            raise InputError(
+                "[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread"
+            )
+
+    @classmethod
+    def default_control(cls, d: Defaults) -> list[int]:
+        return [min(TWO_SIDED_SPANS, refinement_spans(max(d.resolution), d.quality)) + p for p in d.lens["degree"]]
+
+    @property
+    def half_sizes(self) -> list[tuple[float, float]]:
+        return [self.scene.lens.half_size] * 2
+
+    def _bounds(self, k: int) -> tuple[Tensor, Tensor]:
+        low, high = super()._bounds(k)
+        most = torch.full_like(low, self.scene.lens.height_range[1])
+        return torch.stack([-most, low]), torch.stack([most, high])
+
+    def parametrised(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
+        if start is None:
+            return super().parametrised(k, start, loaded)
+        light = None if loaded else entrance_points(self.scene, self.field(k), start)
+        laplacian = self.options.parametrisation.preconditioner == "laplacian"
+        return SidesTogether(*self.bounds(k), start, laplacian, light)
+
+    def objective_in(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
+        stage, o, scene = self.stages[k], self.options, self.lit(scene, k)
+        targets = (self.target,) if self.second is None else (self.target, self.second)
+        rays = rays_of(scene, stage.sampler, stage.rays, self.seed(k), self.device)
+        return TwoSidedObjective(scene, self.field(k), rays, targets, o.loss, stage.rendering, limits=o.limits, dtype=o.dtype)
+
+    def refuse_unreachable(self) -> None:
+        """Its own initial surfaces say what they cannot reach."""
+
+    def transport(self, fixed: bool, seconds: float) -> InitialSurface:
+        second = None if self.second is None else self.second.numpy()
+        return InitialSurface(first_sides(self.scene, grey(self.target.numpy()), second, self.field(0)))
+
+    def advice(self, size: tuple[float, float]) -> str:
+        return ""
+
+    def evaluate(self, designer: Designer, state: State, size: tuple[float, float], timed: bool = False) -> Evaluated:
+        """By the picture, and a second picture or the ray directions behind it."""
+        target, field, seed = self.target.numpy(), designer.field(state.stage), self.options.seed
+        farther, final = None if self.second is None else self.second.numpy(), self.final_rays
+
+        def trace(heights: Tensor, rays: int) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
+            scene, exit = split_heights(self.scene, field, heights)
+            how = {"rays": rays, "device": self.device, "seed": seed}
+            exposure, figures = retrace(scene, field, exit, target, noise=rays == final, **how)
+            second, more = second_figures(scene, field, exit, farther, **how)
+            return exposure.image.cpu().numpy(), second, figures | more
+
+        image, second, figures = trace(state.heights, final)
+        if state.start is not None:
+            began = trace(designer.begun(state), final // STARTS)[2]
+            figures |= {"start_error": began["relative_rms"]}
+            figures |= {
+                f"start_{key}": began[key] for key in ("relative_rms", "second_relative_rms", "angle_rms_mrad") if key in began
+            }
+            if state.unrounded is not None:
+                unrounded = trace(designer.begun(state, rounded=False), final // STARTS)[2]
+                figures |= {"min_radius": radius_figures(self.options.limits.min_radius, began, unrounded)}
+        pair = None if second is None or farther is None else (second, farther)
+        return Evaluated(state, judged(figures, False), image, farther=pair)
