@@ -9,7 +9,7 @@ from PIL import Image
 
 from caustic_cli.config import default_stages
 from caustic_cli.inverse import deconvolution, initial_surface
-from caustic_cli.workflow import design as workflow
+from caustic_cli.kinds import OneSurface, lenslet_array
 from caustic_cli.workflow import evaluation
 
 
@@ -36,10 +36,10 @@ def small_designs(patch, rays: int, report: bool = False) -> None:
     patch: pytest's monkeypatch."""
     patch.setattr(default_stages, "LEAST_CELLS", 64)
     patch.setattr(default_stages, "LEAST_CREASED", 64)
-    patch.setattr(workflow, "LEAST_CELLS", 32)
+    patch.setattr(lenslet_array, "LEAST_CELLS", 32)
     patch.setattr(initial_surface, "FEW_CELLS", 32)
     patch.setattr(deconvolution, "MOST_STEPS", 400)
-    patch.setattr(evaluation, "FINAL_RAYS", rays)
+    patch.setattr(OneSurface, "final_rays", rays)
     if not report:
         patch.setattr(evaluation, "write_report", lambda *args: None)
 

@@ -14,9 +14,10 @@ from caustic_cli.errors import MARK, InputError
 PACKAGE = Path(__file__).resolve().parent.parent / "caustic_cli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-#: What a room may import from the package: commands -> workflow -> project -> config -> inverse -> optics -> scene -> errors, with
-#: studies and exports beside the inverse problem.  They write files and pictures, through io, by which config reads project.toml.
-#: The table of settings is data that stands below every room.
+#: What a room may import from the package: commands -> workflow -> project -> completion -> kinds -> config -> inverse -> optics ->
+#: scene -> errors, with studies and exports beside the inverse problem.  They write files and pictures, through io, by which config
+#: reads project.toml.  The table of settings is data that stands below every room; the completion of all settings ends with that of
+#: the kind of design, and stands above both.
 ALLOWED = {
     "scene": {"scene", "table", "errors"},
     "optics": {"optics", "table", "scene", "errors"},
@@ -26,10 +27,27 @@ ALLOWED = {
     "studies": {"studies", "table", "optics", "scene", "errors", "io"},
     "table": {"table", "errors"},
     "config": {"config", "table", "inverse", "io", "optics", "scene", "errors"},
-    "project": {"project", "table", "config", "inverse", "io", "optics", "scene", "errors"},
-    "workflow": {"workflow", "table", "project", "config", "inverse", "studies", "export", "io", "optics", "scene", "errors"},
+    "kinds": {"kinds", "config", "table", "inverse", "studies", "io", "optics", "scene", "errors"},
+    "completion": {"completion", "kinds", "config", "table", "inverse", "optics", "scene", "errors"},
+    "project": {"project", "completion", "kinds", "table", "config", "inverse", "io", "optics", "scene", "errors"},
+    "workflow": {
+        "workflow",
+        "completion",
+        "kinds",
+        "table",
+        "project",
+        "config",
+        "inverse",
+        "studies",
+        "export",
+        "io",
+        "optics",
+        "scene",
+        "errors",
+    },
 }
 TABLE_MODULES = {"caustic_cli.config.table", "caustic_cli.config.checks"}
+COMPLETION = "caustic_cli.config.completion"
 #: Only the command line may import the command line.
 TOP = {"cli", "__main__", "commands"}
 #: What the package's top level holds, besides the rooms.
@@ -62,14 +80,17 @@ IMPORTS = {module_name(p): imports_in(ast.parse(p.read_text("utf-8")), module_na
 
 
 def part_of(module: str) -> str:
-    """`optics` for caustic_cli.optics.trace, "table" for the table of settings and its checks, "" for the package itself."""
+    """`optics` for caustic_cli.optics.trace, "table" for the table of settings and its checks, "completion" for that of all settings,
+    "" for the package itself."""
+    if COMPLETION in (module, module.rpartition(".")[0]):
+        return "completion"
     return "table" if module in TABLE_MODULES or module.rpartition(".")[0] in TABLE_MODULES else [*module.split("."), ""][1]
 
 
 def own(imported: set[str]) -> set[str]:
     """Parts of the package among the imported names that are modules, the package's own version and name aside."""
     modules = {m for m in imported if m.startswith("caustic_cli.") and (m in IMPORTS or m.rpartition(".")[0] in IMPORTS)}
-    if imported & TABLE_MODULES:
+    if imported & {*TABLE_MODULES, COMPLETION}:
         modules = {m for m in modules if m != "caustic_cli.config"}  # whose front holds nothing
     return {part_of(m) for m in modules} - {"__version__"}
 
@@ -96,14 +117,17 @@ def test_there_is_something_to_check():
 @pytest.mark.parametrize("part", ALLOWED)
 def test_imports_run_one_way(part):
     modules = [m for m in IMPORTS if part_of(m) == part]
-    assert len(modules) >= 2
+    assert len(modules) >= (1 if part == "completion" else 2)
     wrong = {m: sorted(own(IMPORTS[m]) - ALLOWED[part]) for m in modules if own(IMPORTS[m]) - ALLOWED[part]}
     assert not wrong
 
 
 def test_the_top_level_holds_rooms():
     assert {p.name for p in PACKAGE.glob("*.py")} == FRONT
-    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == {*ALLOWED, "commands"} - {"table"}
+    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == {*ALLOWED, "commands"} - {
+        "table",
+        "completion",
+    }
 
 
 @pytest.mark.parametrize(
@@ -264,6 +288,22 @@ def test_no_two_modules_import_each_other():
         visit(module, ())
     assert not cycles
     assert sum(map(len, graph.values())) > 40
+
+
+#: The stage loop and what it needs of the inverse problem: no kind of design, no wave image, no extended source.
+CORE = {"constraints", "designer", "lbfgs", "loss_terms", "losses", "objective", "optimisers", "parametrisation", "penalties"}
+CORE |= {"problem", "ranks", "schedule"}
+
+
+def test_the_stage_loop_knows_no_kind_of_design():
+    """All that its modules import, directly or not."""
+    found, ahead = {"caustic_cli.inverse.designer"}, ["caustic_cli.inverse.designer"]
+    while ahead:
+        more = {m for m in IMPORTS[ahead.pop()] if m in IMPORTS and m.startswith("caustic_cli.inverse.")} - found
+        found |= more
+        ahead += more
+    assert {m.rpartition(".")[2] for m in found} == CORE
+    assert not {"kinds", "config", "studies", "io"} & {part for m in found for part in own(IMPORTS[m])}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))

@@ -18,8 +18,9 @@ from caustic_cli import cli
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.step import write_step
-from caustic_cli.inverse.lenslets import ArrayObjective, assemble, initial_array, lenslets
+from caustic_cli.inverse.lenslets import array_objective, assemble, initial_array, lenslets
 from caustic_cli.inverse.objective import Objective
+from caustic_cli.inverse.schedule import Rendering
 from caustic_cli.inverse.target import tiles
 from caustic_cli.optics.bspline import SplineSpace, open_knots
 from caustic_cli.optics.emission import rays_of
@@ -123,9 +124,9 @@ def test_gradient_of_the_loss_of_an_array():
 
     def one(k, part):
         rays = rays_of(part.scene, "grid", 900)
-        return Objective(part.scene, part.field, rays, filter, torch.from_numpy(goals[k]), "rms", dtype=torch.float64)
+        return Objective(part.scene, part.field, rays, torch.from_numpy(goals[k]), "rms", Rendering(filter), dtype=torch.float64)
 
-    loss = ArrayObjective(lenslets(scene), one)
+    loss = array_objective(lenslets(scene), one)
     shared = torch.zeros_like(heights)
     shared[7, :] = shared[:, 6] = 1.0  # rows of the first borders
     along = bumps(scene, 4, 1.0) - 5.0

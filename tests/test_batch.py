@@ -15,6 +15,7 @@ from rich.console import Console
 from caustic_cli import cli
 from caustic_cli.commands.console import Reporter, ended_words
 from caustic_cli.inverse.designer import Designer
+from caustic_cli.kinds import OneSurface
 from caustic_cli.project import checkpoint
 from caustic_cli.studies.radius import cost_of_radius
 from caustic_cli.workflow import design as workflow
@@ -79,7 +80,7 @@ def test_the_same_design_again_is_no_work(capfd, monkeypatch):
     before = [p.read_bytes() for p in files]
     age(*files)
     monkeypatch.setattr(Designer, "run", forbidden)
-    monkeypatch.setattr(evaluation, "retrace", forbidden)
+    monkeypatch.setattr(OneSurface, "evaluate", forbidden)
     again, err = run([*DESIGN, "--json"], capfd)
     assert again == first and "nothing to do" in err and "--force" in err
     assert [p.read_bytes() for p in files] == before

@@ -13,7 +13,8 @@ from scipy.integrate import dblquad
 from torch.autograd import forward_ad
 
 from caustic_cli import cli
-from caustic_cli.config.completion import complete, without_waves
+from caustic_cli.config.completion import complete
+from caustic_cli.config.wave_stages import without_waves
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba

@@ -17,6 +17,7 @@ from helpers import begun, small_designs
 from PIL import Image
 
 from caustic_cli import cli
+from caustic_cli.kinds import surface
 from caustic_cli.project import checkpoint
 from caustic_cli.workflow import design as workflow
 
@@ -210,8 +211,9 @@ def test_threads_are_what_was_asked_for():
     program = f"""
 import torch
 from caustic_cli import cli
+from caustic_cli.kinds import OneSurface
 from caustic_cli.workflow import evaluation
-evaluation.FINAL_RAYS, evaluation.write_report = 1000, lambda *args: None
+OneSurface.final_rays, evaluation.write_report = 1000, lambda *args: None
 for name in "ab":
     assert cli.run(["design", "blob.png", *{TINY!r}, "--iterations", "3", "-o", name]) == 0
     assert torch.get_num_threads() == 1, torch.get_num_threads()
@@ -475,5 +477,5 @@ def test_a_signal_saves_and_the_design_goes_on(capfd, number, status):
 
 def test_a_place_that_is_taken_is_refused_before_the_transport_is_solved(capfd, monkeypatch):
     design(capfd, "blob.png", *TINY, "--iterations", "1")
-    monkeypatch.setattr(workflow, "first_surface", lambda *args: pytest.fail("solved for nothing"))
+    monkeypatch.setattr(surface, "first_surface", lambda *args: pytest.fail("solved for nothing"))
     assert "holds a design already" in design(capfd, "blob.png", *TINY, code=2)

@@ -14,6 +14,7 @@ from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
+from caustic_cli.inverse.schedule import Rendering
 from caustic_cli.io.archive import open_archive
 from caustic_cli.io.files import MARK, refuse_foreign
 from caustic_cli.io.picture import read_picture
@@ -214,13 +215,11 @@ def test_the_loss_of_colours_is_their_root_mean_square():
     heights = 3.0 + 0.02 * torch.randn(7, 7, generator=g, dtype=torch.float64)
     target = torch.rand(3, 10, 10, generator=g, dtype=torch.float64)
     target[2] = 0.0
-    options = {"apron": 2, "oversample": 2, "dtype": torch.float64, "filter_target": False}
-    made = Objective(scene, field, rays_of(scene, "lines", 900), Filter("cosine", (3, 3)), target, "rms-light", **options)
+    how = Rendering(Filter("cosine", (3, 3)), apron=2, oversample=2, filter_target=False)
+    made = Objective(scene, field, rays_of(scene, "lines", 900), target, "rms-light", how, dtype=torch.float64)
     apart = []
     for k, band in enumerate(scene.bands[:2]):
-        one = Objective(
-            band.scene, field, rays_of(band.scene, "lines", 900), Filter("cosine", (3, 3)), target[k], "rms-light", **options
-        )
+        one = Objective(band.scene, field, rays_of(band.scene, "lines", 900), target[k], "rms-light", how, dtype=torch.float64)
         assert isinstance(one.loss, Loss)
         apart.append(one(heights).loss)
     found = made(heights)

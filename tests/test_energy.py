@@ -14,6 +14,7 @@ from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.source_limits import point_source
+from caustic_cli.kinds import evaluation
 from caustic_cli.optics.bounds import bounds_of, check_exit_above_entrance
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
@@ -25,7 +26,6 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.retrace import require_energy_balance, retrace
-from caustic_cli.workflow import evaluation
 
 
 def sphere(index: float, magnification: float, pixels: int = 100, **lens) -> tuple[Scene, HeightField, torch.Tensor]:

@@ -21,13 +21,14 @@ from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.kinds import surface
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import tradeoff
 
 
@@ -192,7 +193,7 @@ def test_the_largest_magnification_is_not_known_of_a_picture_across_its_lens():
 def test_nothing_is_solved_for_a_picture_out_of_reach(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(workflow, "first_surface", lambda *args: pytest.fail("solved for nothing"))
+    monkeypatch.setattr(surface, "first_surface", lambda *args: pytest.fail("solved for nothing"))
     assert cli.run(["design", "blob.png", "--screen-shift", "2000,0", "--resolution", "32"]) == 2
     assert "no light can be refracted to the picture" in capfd.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["blob.png"]
@@ -219,7 +220,7 @@ def test_the_objective_knows_the_light_on_the_lens(source):
     field = HeightField.of(lens)
     heights = 3.0 + 0.05 * torch.randn(8, 8, dtype=torch.float64)
     target, rays = torch.from_numpy(blob(24)), rays_of(scene, "stratified", 60_000, 5)
-    objective = Objective(scene, field, rays, Filter("cosine", (3, 3)), target, "light", apron=3, dtype=torch.float64)
+    objective = Objective(scene, field, rays, target, "light", Rendering(Filter("cosine", (3, 3)), apron=3), dtype=torch.float64)
     seen = objective(heights)
     image = expose(scene, field, heights, rays, Filter("cosine", (3, 3)), screen=scene.screen.grown((3, 3)))
     fade = np.minimum.outer(*(2 * [np.clip(np.minimum(np.arange(1, 31), np.arange(30, 0, -1)) - 1, 0, 3) / 3.0]))

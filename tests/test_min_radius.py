@@ -12,14 +12,15 @@ from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
+from caustic_cli.inverse.designer import Designer
 from caustic_cli.inverse.penalties import Penalty
+from caustic_cli.kinds import problem_of
+from caustic_cli.kinds.evaluation import radius_figures
 from caustic_cli.optics import curvature
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 from caustic_cli.studies.retrace import retrace
-from caustic_cli.workflow.design import _designer
-from caustic_cli.workflow.evaluation import radius_figures
 
 BASE = "--resolution 24 --quality draft --control 35 --rays 20000 --iterations 3 --waves off --margin 0 --linear --quiet --json"
 
@@ -60,7 +61,8 @@ def test_a_design_says_what_its_radius_costs(here, capfd):
     figures = run(capfd, f"design islands.png {BASE} -o p --min-radius {radius}")
     said = figures["min_radius"]
     project, state = saved("p")
-    designer, target = _designer(project, "cpu")
+    designer = Designer(problem_of(project))
+    target = designer.problem.target.numpy()
     assert bent(designer.field(0), state.unrounded, 1) > 2.0 / radius  # it bites
     assert bent(designer.field(0), state.start, 1) <= 1.0 / radius
     assert bent(designer.field(state.stage), state.heights, 1) <= 1.0 / radius
@@ -121,7 +123,7 @@ def test_the_tool_of_a_mirror_comes_from_the_light(here, capfd):
     radius = 40.0
     figures = run(capfd, f"design islands.png {BASE} -o p --mirror --min-radius {radius}")
     project, state = saved("p")
-    field = _designer(project, "cpu")[0].field(state.stage)
+    field = problem_of(project).field(state.stage)
     assert bent(field, state.heights, -1) <= 1.0 / radius
     assert bent(field, state.heights, 1) > 1.0 / radius  # ridges are as sharp as they like
     assert figures["min_radius"]["in_black_per_mm"] is not None

@@ -12,7 +12,8 @@ from helpers import small_designs, write_blob
 from PIL import Image
 
 from caustic_cli import cli
-from caustic_cli.config.completion import build_options, build_stages, complete
+from caustic_cli.config.completion import complete
+from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.designer import Designer
@@ -20,6 +21,7 @@ from caustic_cli.inverse.parametrisation import Architecture, parametrise
 from caustic_cli.inverse.range_training import BATCH, RangeAdam, RangeObjective
 from caustic_cli.inverse.scene_parameters import EVALUATED, Range, Ranges
 from caustic_cli.io.files import is_ours
+from caustic_cli.kinds import NetworkOverRange
 from caustic_cli.project import checkpoint
 from caustic_cli.studies import architectures
 from caustic_cli.studies.report import write
@@ -66,7 +68,9 @@ def designer(over: Ranges = THROWS, source: dict | None = None, **options) -> De
     full = complete(given | ({"source": source} if source else {}), 1.0)
     scene = build_scene(full)
     target = torch.from_numpy(comparison.disc(scene, tuple(full["target"]["size"])))
-    return Designer(scene, target, build_stages(full), replace(build_options(full), **options))
+    own = build_options(full)
+    own = replace(own, parametrisation=replace(own.parametrisation, **options))
+    return Designer(NetworkOverRange(scene, target, build_stages(full), own, ranges=over))
 
 
 # the network
@@ -122,12 +126,12 @@ def test_zero_last_begins_at_the_start_whatever_the_inputs():
 
 def stepped(made: Designer) -> RangeAdam:
     """Adam on the first stage, before its first step, with parameters that are nothing in particular."""
-    module = made._parametrise(0, None)
+    module = made.problem.parametrised(0, None)
     generator = torch.Generator().manual_seed(2)
     module.double()
     for p in module.parameters():
         p.data += 0.05 * torch.randn(p.shape, generator=generator, dtype=torch.float64)
-    objective = made._objective(0, module)
+    objective = made.objective(0, module)
     assert isinstance(objective, RangeObjective)
     return RangeAdam(objective, module, 1e-3)
 
@@ -176,10 +180,9 @@ def test_the_loss_is_the_mean_over_lenses_in_their_own_scenes():
     objective, z = adam.over, adam._objective_here()[0].detach()
     e, found = objective(z, 0), []
     for k, (row, heights) in enumerate(zip(objective.values(0).tolist(), z, strict=True)):
-        alone = replace(made.options, over=None)
         scene = objective.ranges.scene(made.scene, row)
         assert scene.source.positions[0] == pytest.approx((row[1], 0.0, row[0]), abs=1e-12)
-        fresh = Designer(scene, made.target, made.stages, alone)._on_rays(scene, 0, made.field(0), made.target, 3000)
+        fresh = made.problem.on_rays(scene, 0, made.field(0), made.problem.target, 3000)
         fresh = fresh.moved(scene, objective.at(0)[k].samplers[0])
         found.append(fresh(heights))
         assert torch.equal(found[-1].gradient / BATCH, e.gradient[k])
@@ -209,7 +212,7 @@ def test_a_few_iterations_help_all_over_the_range():
     done = made.run(state, iterations=30)
     losses = [row[2] for row in done.history]
     assert np.mean(losses[-5:]) < 0.8 * losses[0]
-    ends = [made.heights_at(done, values) for values in ((250.0,), (350.0,))]
+    ends = [made.problem.heights_at(made, done, values) for values in ((250.0,), (350.0,))]
     assert float((ends[0] - ends[1]).abs().max()) > 1e-4
 
 

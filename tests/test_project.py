@@ -46,11 +46,11 @@ def designed(tmp_path_factory):
     (folder / "c.toml").write_text(CONFIG)
     with pytest.MonkeyPatch.context() as patch:
         small_designs(patch, 10_000)
-        project, first = workflow.begin(
+        begun = workflow.begin(
             folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=Reporter(quiet=True)
         )
-        workflow.design(project, first, "cpu", Reporter(quiet=True), 0.0)
-    return project.path
+        workflow.design(begun, "cpu", Reporter(quiet=True), 0.0)
+    return begun.project.path
 
 
 @pytest.fixture

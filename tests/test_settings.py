@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import Derivation, build_options, build_stages, complete
+from caustic_cli.config.completion import Derivation, complete
 from caustic_cli.config.default_stages import GAPS, transport_cells
+from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, build_lens, build_scene, dump, parse
 from caustic_cli.errors import InputError
 

@@ -11,6 +11,7 @@ from helpers import small_designs, write_blob
 from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
+from caustic_cli.config.design import build_stages
 from caustic_cli.errors import InputError
 from caustic_cli.scene import Disc, Offset, Points
 from caustic_cli.workflow import design as workflow
@@ -253,7 +254,7 @@ def test_an_option_may_be_meant_for_the_source_of_a_stage(capfd):
     )
     project = workflow.Project.open("blob.caustic")
     assert project.settings["source"]["type"] == "plane"
-    assert workflow.build_stages(project.settings)[0].source == Points(((0.0, 0.0, -40.0),))
+    assert build_stages(project.settings)[0].source == Points(((0.0, 0.0, -40.0),))
 
 
 def test_a_refusal_names_no_file_that_was_never_written(capfd):

@@ -17,7 +17,7 @@ from caustic_cli.config import tolerances as schema
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Evaluation
-from caustic_cli.inverse.robust import RobustObjective
+from caustic_cli.inverse.robust import robust_objective
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.coherent import central_mode
 from caustic_cli.optics.form_error import FormErrors, refined
@@ -237,7 +237,7 @@ def test_a_robust_design_moves_the_beam():
         scenes.append(s)
         return Flat()
 
-    RobustObjective(objective, scene, field, heights, schema.parse("[lens_shift]\nsigma = [0.5, 0]", "t"))
+    robust_objective(objective, scene, field, heights, schema.parse("[lens_shift]\nsigma = [0.5, 0]", "t"))
     middles = []
     for light in (s.source.profile for s in scenes):
         x = (np.arange(len(light)) + 0.5) / len(light) * 10.0 - 5.0
@@ -404,13 +404,13 @@ def test_the_loss_over_draws_and_its_gradient():
             return Evaluation(float((d * d).sum()), {EXIT: 2.0 * d * weights}, 1.0, d)
 
     errors = schema.parse("[throw]\nsigma = 5\n[thickness]\nsigma = 0.1", "t")
-    loss = RobustObjective(lambda s, _: Square(s), scene, field, heights, errors)
+    loss = robust_objective(lambda s, _: Square(s), scene, field, heights, errors)
     found, way = loss(heights), torch.from_numpy(np.random.default_rng(1).standard_normal(heights.shape))
     ends = [loss(heights + sign * 1e-5 * way).loss for sign in (-1, 1)]
     assert float((found.gradient * way).sum()) == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-5)
     assert found.loss > Square(scene)(heights).loss
     with pytest.raises(InputError, match="names no error"):
-        RobustObjective(lambda s, _: Square(s), scene, field, heights, schema.parse("[roughness]\nsigma = 0.01", "t"))
+        robust_objective(lambda s, _: Square(s), scene, field, heights, schema.parse("[roughness]\nsigma = 0.01", "t"))
 
 
 def test_a_robust_design_and_its_study(tmp_path, monkeypatch, capsys):

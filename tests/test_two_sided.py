@@ -12,7 +12,9 @@ from PIL import Image
 
 from caustic_cli import cli, load
 from caustic_cli.export.mesh import closed_mesh
+from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.initial_two_sided import first_sides
+from caustic_cli.inverse.schedule import Rendering
 from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.io.archive import open_archive
@@ -74,7 +76,9 @@ def test_a_loss_of_zero_has_no_gradient():
 
     def evaluation(target: torch.Tensor):
         rays = rays_of(scene, "grid", 10_000)
-        return TwoSidedObjective(scene, field, rays, Filter("cosine", (3, 3)), (target,), "rms", filter_target=False)(plate)
+        return TwoSidedObjective(scene, field, rays, (target,), "rms", Rendering(Filter("cosine", (3, 3)), filter_target=False))(
+            plate
+        )
 
     found = evaluation(evaluation(torch.from_numpy(ONE)).image)
     assert found.loss == 0.0 and bool((found.gradient == 0.0).all())
@@ -85,7 +89,9 @@ def test_losses_of_the_images_alone_have_gradients_of_both_sides(loss):
     """They do not depend on what leaves the lens."""
     scene = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget(FAR))
     field, targets = HeightField.of(LENS), (torch.from_numpy(ONE), torch.from_numpy(TWO))
-    objective = TwoSidedObjective(scene, field, rays_of(scene, "grid", 10_000), Filter("cosine", (5, 5)), targets, loss, apron=6)
+    objective = TwoSidedObjective(
+        scene, field, rays_of(scene, "grid", 10_000), targets, loss, Rendering(Filter("cosine", (5, 5)), apron=6)
+    )
     nets = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, 15.0, dtype=torch.float64)])
     assert bool(torch.isfinite(objective(nets).gradient).all())
 
@@ -107,11 +113,10 @@ def test_the_loss_has_the_gradients_of_both_sides(second):
         scene,
         field,
         rays_of(scene, "grid", 40_000),
-        Filter("cosine", (5, 5)),
         tuple(targets),
         "rms-light + 0.01 laplacian",
-        apron=6,
-        max_slope=0.3,
+        Rendering(Filter("cosine", (5, 5)), apron=6),
+        limits=Limits(max_slope=0.3),
         dtype=torch.float64,
     )
     gradient = objective(nets).gradient

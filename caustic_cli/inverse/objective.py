@@ -16,6 +16,7 @@ import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -30,11 +31,13 @@ from caustic_cli.inverse.schedule import Rendering
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.memory import smaller_chunk
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
 from caustic_cli.scene import Scene, Screen
+
+if TYPE_CHECKING:
+    from caustic_cli.optics.spread import Convolution
 
 #: Rays traced at a time, and most rays whose prepared chunks are kept between evaluations; and the same for tensor grids of axial
 #: rays, which need little memory per ray: 8e6 on 2000 x 2000 pixels take 0.6 s, by 2^20 at a time 3 s.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -21,9 +21,6 @@ from caustic_cli.optics.waves import WaveImage
 from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import RELATIVE_NOISE, evaluation_rays, retrace
 from caustic_cli.studies.waves import unseen_figures, wave_figures
-
-if TYPE_CHECKING:
-    from caustic_cli.kinds.surface import OneSurface
 
 #: Losses that measure the error of the picture alone; others may increase it in exchange for another objective.
 LIKENESS = {"rms", "rms-light", "throughput"}
@@ -58,12 +55,13 @@ class Seen(NamedTuple):
 class Judge:
     """Figures of a finished lens, and the lens that is kept; see `OneSurface.evaluate`."""
 
-    def __init__(self, problem: OneSurface, designer: Designer, state: State, size: tuple[float, float], timed: bool):
-        self.problem, self.designer, self.state, self.timed = problem, designer, state, timed
+    def __init__(self, designer: Designer, state: State, rays: int, size: tuple[float, float], timed: bool):
+        self.problem, self.designer, self.state, self.timed = designer.problem, designer, state, timed
+        self.count = evaluation_rays(designer.scene, rays)
         self.field = designer.field(state.stage)
         self.refined = any(s.waves for s in designer.stages[: state.stage + 1])
-        self.seen = Resolution.before(problem.scene, size)
-        self.target = problem.target.numpy()
+        self.seen = Resolution.before(designer.scene, size)
+        self.target = designer.problem.target.numpy()
         self.start: dict[str, Any] | None = None  # figures of the initial surface
         self.exposure, self.light, self.figures = self.see(state.heights)
 
@@ -73,7 +71,7 @@ class Judge:
         return retrace(
             *trace_arguments(scene, self.field, heights),
             self.target,
-            rays=evaluation_rays(scene, self.problem.final_rays),
+            rays=self.count,
             device=self.problem.device,
             seed=self.problem.options.seed,
             noise=noise,
@@ -95,7 +93,7 @@ class Judge:
         """Keep the initial surface if it is better, where the loss measures the error of the picture alone."""
         problem, state = self.problem, self.state
         by_likeness = {name for _, name in parse(problem.options.loss)} <= LIKENESS
-        if state.start is None or not (by_likeness and problem.one_scene):
+        if state.start is None or not by_likeness:
             return
         heights = problem.feasible(state.stage, self.designer.begun(state))
         # other light has an estimate of the noise anyway

@@ -24,7 +24,6 @@ from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import retrace
 
 OVER_ITERATIONS = 200  # caustic convergence, study design, networks
-NEEDS_NETWORK = "⟨design.over⟩ needs a network, which gives a lens for every value: ⟨+design.network⟩ dense or sparse"
 #: Divisor of the rays for each of the lenses of an evaluation.
 OVER = 4
 
@@ -54,12 +53,7 @@ class NetworkOverRange(OneSurface):
     @classmethod
     def complete(cls, d: Defaults) -> None:
         super().complete(d)
-        if not d.trained:
-            raise InputError(NEEDS_NETWORK)
-        if d.design["initial"] == "zero":
-            raise InputError(
-                "⟨design.initial⟩ zero leaves the inputs of a network without any effect, for good: zero-last, uniform or random"
-            )
+        _refuse_idle_inputs(d.trained, d.design["initial"])
         if d.design.get("robust"):
             raise InputError("⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already")
 
@@ -74,8 +68,8 @@ class NetworkOverRange(OneSurface):
 
     def check(self) -> None:
         super().check()
-        if self.options.parametrisation.free:
-            raise InputError(NEEDS_NETWORK)
+        how = self.options.parametrisation
+        _refuse_idle_inputs(not how.free, how.initial)
         if any(s.spread or s.source for s in self.stages):
             raise InputError("⟨design.over⟩ needs stages on the rays of the scene's own source, without spread")
 
@@ -138,6 +132,20 @@ class NetworkOverRange(OneSurface):
                 row["middle_relative_rms"] = other["relative_rms"]
             found.append(row)
         return found
+
+
+def _refuse_idle_inputs(trained: bool, initial: str) -> None:
+    """Refuse heights that do not depend on the parameters.
+
+    Raises:
+        InputError: there is no network, or one whose inputs never have an effect.
+    """
+    if not trained:
+        raise InputError("⟨design.over⟩ needs a network, which gives a lens for every value: ⟨+design.network⟩ dense or sparse")
+    if initial == "zero":
+        raise InputError(
+            "⟨design.initial⟩ zero leaves the inputs of a network without any effect, for good: zero-last, uniform or random"
+        )
 
 
 class NetworkAmongElements(NetworkOverRange, AmongElements):

@@ -409,8 +409,9 @@ class OneSurface(Problem):
             size: width and height of the picture, mm; timed: under a time limit, do not increase the number of rays, and limit the
                 iterations for the least error.
         """
-        judge = Judge(self, designer, state, size, timed)
-        judge.compare_with_start()
+        judge = Judge(designer, state, self.final_rays, size, timed)
+        if self.one_scene:
+            judge.compare_with_start()
         judge.compare_unrounded()
         bounds = self.source_limits(SMOOTH_STEPS if timed else None)
         judge.figures |= {

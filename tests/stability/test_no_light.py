@@ -11,11 +11,13 @@ from helpers import small_designs
 
 from caustic_cli import cli
 from caustic_cli.errors import CausticError
-from caustic_cli.inverse import designer
-from caustic_cli.inverse.designer import Designer, Options
+from caustic_cli.inverse import problem
+from caustic_cli.inverse.designer import Designer
 from caustic_cli.inverse.losses import LOSSES, Loss, NoLight
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.schedule import Stage
+from caustic_cli.inverse.parametrisation import Parametrisation
+from caustic_cli.inverse.problem import Options, Problem
+from caustic_cli.inverse.schedule import Rendering, Stage
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
@@ -61,7 +63,7 @@ def test_all_rays_lost(why, kernels, dtype, compare):
     text = json.dumps(figures_of_merit(e, TARGET.numpy()), allow_nan=False)
     naive = float(((e.image / e.image.sum() - 1.0 / 144) ** 2).mean())
     compare("all rays lost", "the loss against 1", naive, abs(json.loads(text)["relative_rms"] - 1.0), 1e-12)
-    objective = Objective(s, field, rays, Filter("cosine", (3, 3)), TARGET, "rms-light", dtype=dtype)
+    objective = Objective(s, field, rays, TARGET, "rms-light", Rendering(Filter("cosine", (3, 3))), dtype=dtype)
     with pytest.raises(NoLight, match="no light reaches the screen"):
         objective(prism(field, slope))
 
@@ -95,14 +97,10 @@ def small(optimizer: str, lr: float = 1e-3, network: str = "none", index: float 
     lens = Lens(size=(10.0, 10.0), control=(8, 8), index=index, offset=Offset(5.0), height_range=(-4.0, 4.0))
     g = torch.Generator().manual_seed(0)
     target = torch.rand(12, 12, generator=g, dtype=torch.float64) + 0.2
-    return Designer(
-        Scene(PlaneWave(), lens, Screen((size, size), 60.0, (12, 12))),
-        target,
-        [Stage((8, 8), 900, "grid", Filter("cosine", (3, 3)), 0.0, 0, 12)],
-        Options(
-            loss="rms", optimizer=optimizer, lr=lr, network=network, preconditioner="none" if optimizer == "adam" else "laplacian"
-        ),
-    )
+    preconditioner = "none" if optimizer == "adam" else "laplacian"
+    options = Options("rms", optimizer, lr, Parametrisation(network, preconditioner=preconditioner))
+    scene = Scene(PlaneWave(), lens, Screen((size, size), 60.0, (12, 12)))
+    return Designer(Problem(scene, target, [Stage((8, 8), 900, "grid", iterations=12)], options))
 
 
 class Holes(Objective):
@@ -127,7 +125,7 @@ class Holes(Objective):
 @pytest.mark.parametrize("optimizer", ["adam", "lbfgs"])
 def test_a_bad_step_is_taken_back(optimizer, how, monkeypatch):
     """Said once; the run goes on, every state handed out is finite, and the loss still falls."""
-    monkeypatch.setattr(designer, "Objective", type("H", (Holes,), {"bad": (3, 4, 8), "how": how}))
+    monkeypatch.setattr(problem, "Objective", type("H", (Holes,), {"bad": (3, 4, 8), "how": how}))
     d, said, states = small(optimizer, 0.02), [], []
     state = d.run(d.begin(), iterations=12, notice=said.append, on_iteration=lambda s: states.append(s.heights.clone()))
     assert len(states) == 12 == len(state.history)
@@ -146,8 +144,8 @@ def test_adam_with_steps_far_too_long(network, compare):
     assert all(row[3] > 0 and math.isfinite(row[2]) for row in state.history)
     assert said, "this case no longer meets a bad step"
     naive = d.begin()
-    heights = d._parametrise(0, naive.heights if network == "none" else None)
-    objective = d._objective(0, heights)
+    heights = d.problem.parametrised(0, naive.heights if network == "none" else None)
+    objective = d.objective(0, heights)
     adam = torch.optim.Adam(heights.parameters(), lr=30.0)
     worst = 0.0
     for _ in range(8):
@@ -225,7 +223,7 @@ def test_one_ray(kernels, dtype):
         e = expose(s, field, heights, rays, Filter("cosine", (3, 3)), dtype)
         assert float(e.image.sum()) + sum(e.lost.values()) == pytest.approx(1.0, abs=1e-6)
         if float(e.image.sum()) > 0:
-            found = Objective(s, field, rays, Filter("cosine", (3, 3)), TARGET, "rms-light", dtype=dtype)(heights)
+            found = Objective(s, field, rays, TARGET, "rms-light", Rendering(Filter("cosine", (3, 3))), dtype=dtype)(heights)
             assert math.isfinite(found.loss) and bool(torch.isfinite(found.gradient).all())
             checked += 1
     assert checked >= 2
