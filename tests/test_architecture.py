@@ -80,8 +80,8 @@ IMPORTS = {module_name(p): imports_in(ast.parse(p.read_text("utf-8")), module_na
 
 
 def part_of(module: str) -> str:
-    """`optics` for caustic_cli.optics.trace, "table" for the table of settings and its checks, "completion" for that of all settings,
-    "" for the package itself."""
+    """`optics` for caustic_cli.optics.trace, "table" for the table of settings and its checks, "completion" for that of all
+    settings, "" for the package itself."""
     if COMPLETION in (module, module.rpartition(".")[0]):
         return "completion"
     return "table" if module in TABLE_MODULES or module.rpartition(".")[0] in TABLE_MODULES else [*module.split("."), ""][1]

@@ -1,4 +1,4 @@
-"""What it takes to add a reconstruction filter, an export format, an effect, a surface and a source: done on a copy, and counted.
+"""What it takes to add a filter, an export format, an effect, a surface, a source or a kind of design: done on a copy.
 
     python tests/test_extending.py      prints the table of files that each addition touches
 
@@ -312,12 +312,94 @@ assert (scene.source.kind, len(scene.source.powers), rays.count, again["source"]
 """,
 )
 
+KIND = Addition(
+    3,
+    new={
+        "kinds/two_throws.py": '''
+    """A lens that shows its picture at two distances of the screen: the loss is the mean over both."""
+
+    from __future__ import annotations
+
+    from dataclasses import replace
+
+    from caustic_cli.config.settings import value_of
+    from caustic_cli.inverse.mixture import Member, Mixture
+    from caustic_cli.kinds.surface import OneSurface
+
+
+    class TwoThrows(OneSurface):
+        """farther: z of the other screen, mm."""
+
+        one_scene = False
+
+        def __init__(self, *args, farther, **more):
+            self.farther = farther
+            super().__init__(*args, **more)
+
+        @classmethod
+        def applies(cls, s):
+            return value_of(s["design"], "design.farther") > 0
+
+        @classmethod
+        def further(cls, described, scene):
+            return {"farther": value_of(described.settings["design"], "design.farther")}
+
+        @property
+        def scenes(self):
+            """With either screen."""
+            return [self.scene, replace(self.scene, screen=replace(self.scene.screen, z=self.farther))]
+
+        def objective(self, k, begun):
+            """Half of the mean square each."""
+            return Mixture([Member(self.objective_in(scene, k, begun), 0.5, 0.5, 0.5) for scene in self.scenes], 2.0)
+
+        def further_figures(self, designer, state):
+            """The error on the other screen."""
+            there = OneSurface(self.scenes[1], self.target, self.stages, self.options)
+            return {"error_farther": there.errors(designer, state, 10_000, 0)[0]["relative_rms"]}
+'''
+    },
+    edits=(
+        (
+            "kinds/__init__.py",
+            "from caustic_cli.kinds.two_sides import TwoSides\n",
+            "from caustic_cli.kinds.two_sides import TwoSides\nfrom caustic_cli.kinds.two_throws import TwoThrows\n",
+        ),
+        ("kinds/__init__.py", "    RobustSurface,\n", "    RobustSurface,\n    TwoThrows,\n"),
+        (
+            "config/table.py",
+            '    Setting("design.over", ',
+            '    Setting("design.farther", "number", "z of another screen with the same picture", "mm", 0.0, default=0.0,\n'
+            '            written=False),\n    Setting("design.over", ',
+        ),
+    ),
+    used="""
+    from pathlib import Path
+    import numpy as np
+    from caustic_cli import cli
+    from caustic_cli.kinds import OneSurface, problem_of
+    from caustic_cli.project.project import Project
+    OneSurface.final_rays = 2000
+    np.save("picture.npy", np.outer(np.arange(1.0, 9.0), np.ones(8)))
+    Path("two.toml").write_text("[design]\\nfarther = 400.0")
+    small = ("--resolution", "8", "--control", "6", "--start", "offset", "--rays", "200", "--iterations", "3", "--waves", "off")
+    assert cli.run(["design", "picture.npy", "--config", "two.toml", *small, "--quiet"]) == 0
+    assert cli.run(["design", "--resume", "picture.caustic", "--iterations", "5", "--quiet"]) == 0
+    project = Project.open("picture.caustic")
+    figures = project.load().results
+    assert figures["iterations"] == 5 and figures["error_farther"] != figures["relative_rms"]
+    mean = problem_of(project).objective(0, None)
+    assert [m.objective.scene.screen.z for m in mean.members] == [300.0, 400.0]
+""",
+)
+
 ADDITIONS = {
     "a reconstruction filter": FILTER,
     "an export format": EXPORT,
     "an effect": EFFECT,
     "a surface": SURFACE,
     "a source": SOURCE,
+    "a kind of design": KIND,
 }
 
 

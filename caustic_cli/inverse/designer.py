@@ -18,8 +18,9 @@ from torch import Tensor
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.lbfgs import UNFIT
+from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.parametrisation import Heights
-from caustic_cli.inverse.problem import LossOfHeights, Problem, Skipped
+from caustic_cli.inverse.problem import Problem, Skipped
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 
@@ -29,26 +30,27 @@ FLAT_SPAN = 10
 
 @dataclass
 class State:
-    """State of a design.
+    """State of a design."""
 
-    stage, iteration: index of the stage and iterations done in it; total: iterations in total; heights (n, m) mm float64, the
-    current lens; parameters, optimizer: tensors by name, empty before a stage begins; history: rows (iteration, stage, loss,
-    on_screen, seconds); seconds: elapsed; reason: of its end, "" while running; start (n_0, m_0), the initial heights on the
-    control net of the first stage; unrounded, of that shape, the same without the limit of the radius; image, of the last iteration
-    of this run, which is not saved.
-    """
-
+    #: Current lens, (n, m) mm float64.
     heights: Tensor
+    #: Index of the stage, iterations done in it, and in total.
     stage: int = 0
     iteration: int = 0
     total: int = 0
+    #: Tensors by name, empty before a stage begins.
     parameters: dict[str, Tensor] = field(default_factory=dict)
     optimizer: dict[str, Tensor] = field(default_factory=dict)
+    #: Rows (iteration, stage, loss, on_screen, seconds).
     history: list[tuple[int, int, float, float, float]] = field(default_factory=list)
+    #: Elapsed.
     seconds: float = 0.0
+    #: Of its end, "" while running.
     reason: str = ""
+    #: Initial heights on the control net of the first stage (n_0, m_0), and the same without the limit of the radius.
     start: Tensor | None = None
     unrounded: Tensor | None = None
+    #: Of the last iteration of this run; not saved.
     image: Tensor | None = None
 
 

@@ -53,7 +53,7 @@ BESIDE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class PlanePicture:
     """A picture on a plane: irradiance (k, l), half sizes, mm, z of the plane and centre of the picture there, mm."""
 
     light: np.ndarray
@@ -118,9 +118,9 @@ def first_sides(
     assert behind is not None
     least, most = CELLS
     grid = _CellGrid.of(lens.half_size, cells or min(most, max(least, A_PIXEL * max(target.shape))))
-    near = Picture(target, scene.screen.half_size, scene.screen.z, scene.screen.shift)
+    near = PlanePicture(target, scene.screen.half_size, scene.screen.z, scene.screen.shift)
     if second is not None and behind.screen is not None:
-        slopes = slopes_behind(near, Picture(second, behind.screen.half_size, behind.screen.z, behind.screen.shift))
+        slopes = slopes_behind(near, PlanePicture(second, behind.screen.half_size, behind.screen.z, behind.screen.shift))
     else:
         slopes = slopes_towards(near, behind.focus)
     (px, py), lit = near.corners, near.lit
@@ -141,7 +141,7 @@ def first_sides(
     return nets
 
 
-def slopes_behind(near: Picture, far: Picture) -> tuple[np.ndarray, np.ndarray]:
+def slopes_behind(near: PlanePicture, far: PlanePicture) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (dx/dz, dy/dz) of the rays from the pixel corners of the near picture to the far one, by optimal transport."""
     small = [_resampled(p) for p in (near, far)]
     if np.count_nonzero(small[0].light) * small[1].light.size > np.count_nonzero(small[1].light) * small[0].light.size:
@@ -158,7 +158,7 @@ def slopes_behind(near: Picture, far: Picture) -> tuple[np.ndarray, np.ndarray]:
     return (qx - x) / far_off, (qy - y) / far_off
 
 
-def slopes_towards(near: Picture, focus: tuple[float, float, float] | None) -> tuple[np.ndarray, np.ndarray]:
+def slopes_towards(near: PlanePicture, focus: tuple[float, float, float] | None) -> tuple[np.ndarray, np.ndarray]:
     """The same for light that leaves the picture along z, or towards a focus behind it, mm."""
     x, y = near.corners
     if focus is None:
@@ -238,7 +238,7 @@ def _on_exit(light: np.ndarray, ex: np.ndarray, ey: np.ndarray, grid: _CellGrid)
     return gaussian_filter(total, SMOOTH)
 
 
-def _resampled(picture: Picture) -> Picture:
+def _resampled(picture: PlanePicture) -> PlanePicture:
     """The picture resampled to about PAIRED cells along each axis: pixels subdivided or binned, zero-padded at the high edges."""
     light = picture.light
     cut = [min(CUT, max(1, round(PAIRED / n))) for n in light.shape]
@@ -249,4 +249,4 @@ def _resampled(picture: Picture) -> Picture:
     light = light.reshape(light.shape[0] // by[0], by[0], light.shape[1] // by[1], by[1]).sum((1, 3))
     half = picture.half[0] * grown[0], picture.half[1] * grown[1]
     x, y = (c + g - h for c, g, h in zip(picture.centre, half, picture.half, strict=True))
-    return Picture(light, half, picture.z, (x, y))
+    return PlanePicture(light, half, picture.z, (x, y))

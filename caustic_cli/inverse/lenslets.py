@@ -26,7 +26,8 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import CELLS, first_surface
-from caustic_cli.inverse.mixture import Case, Mixture, SceneObjective
+from caustic_cli.inverse.mixture import Member, Mixture
+from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
@@ -146,7 +147,7 @@ def initial_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[in
     )
 
 
-def array_objective(parts: Sequence[Lenslet], objective: Callable[[int, Lenslet], SceneObjective]) -> Mixture:
+def array_objective(parts: Sequence[Lenslet], objective: Callable[[int, Lenslet], LossOfHeights]) -> Mixture:
     """The loss of an array as a function of its heights, each lenslet against its own target.
 
         L = sqrt(mean over lenslets of L_k^2),    L_k the loss of lenslet k as a lens by itself
@@ -159,6 +160,6 @@ def array_objective(parts: Sequence[Lenslet], objective: Callable[[int, Lenslet]
         objective: returns the loss of a lenslet, given its number.
     """
     return Mixture(
-        [Case(objective(k, one), 1.0 / len(parts), one.share, one.share, (one.rows, one.columns)) for k, one in enumerate(parts)],
+        [Member(objective(k, one), 1.0 / len(parts), one.share, one.share, (one.rows, one.columns)) for k, one in enumerate(parts)],
         2.0,
     )

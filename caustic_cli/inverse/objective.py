@@ -16,7 +16,7 @@ import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
@@ -59,6 +59,15 @@ class Evaluation:
     def gradient(self) -> Tensor:
         """Gradient of the exit (n, m), or of all surfaces, (k, n, m)."""
         return torch.stack([*self.gradients.values()]) if len(self.gradients) > 1 else self.gradients[EXIT]
+
+
+class LossOfHeights(Protocol):
+    """The loss as a function of the heights, in the optimisers' eyes."""
+
+    loss: Loss | ColorLoss
+
+    def __call__(self, heights: Tensor) -> Evaluation:
+        """Value and gradient at heights, mm."""
 
 
 def penalty_of(scene: Scene, field: HeightField, loss: str, limits: Limits, device: str | torch.device) -> Penalty:

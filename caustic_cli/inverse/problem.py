@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -18,8 +17,7 @@ from caustic_cli.config.table import check_all
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.loss_terms import parse
-from caustic_cli.inverse.losses import ColorLoss, Loss
-from caustic_cli.inverse.objective import Evaluation, Objective
+from caustic_cli.inverse.objective import LossOfHeights, Objective
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import Heights, Parametrisation
 from caustic_cli.inverse.schedule import Stage
@@ -36,15 +34,6 @@ class Skipped(CausticError):
     def __init__(self, words: str, reason: str):
         super().__init__(words)
         self.reason = reason
-
-
-class LossOfHeights(Protocol):
-    """The loss as a function of the heights, in the optimisers' eyes."""
-
-    loss: Loss | ColorLoss
-
-    def __call__(self, heights: Tensor) -> Evaluation:
-        """Value and gradient at heights, mm."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.inverse.mixture import Case, Mixture
+from caustic_cli.inverse.mixture import Member, Mixture
 from caustic_cli.inverse.objective import Evaluation, Objective
 from caustic_cli.inverse.optimisers import Adam
 from caustic_cli.inverse.parametrisation import Heights
@@ -56,7 +56,7 @@ class RangeObjective:
         """Mean loss, its gradient (k, n, m), mean fraction of the light on the screen and mean image, of heights (k, n, m) mm at
         the parameter values of an iteration."""
         part = 1.0 / BATCH
-        return Mixture([Case(one, part, part, part, (k,)) for k, one in enumerate(self.at(iteration))], 1.0)(heights)
+        return Mixture([Member(one, part, part, part, (k,)) for k, one in enumerate(self.at(iteration))], 1.0)(heights)
 
 
 class RangeAdam(Adam):

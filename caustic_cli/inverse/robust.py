@@ -15,7 +15,8 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.mixture import Case, Mixture, SceneObjective
+from caustic_cli.inverse.mixture import Member, Mixture
+from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.optics.form_error import FormErrors
 from caustic_cli.optics.misalignment import Misalignment, reason_ignored
 from caustic_cli.optics.surfaces import HeightField
@@ -29,7 +30,7 @@ PURPOSE = 2
 
 
 def robust_objective(
-    objective: Callable[[Scene, Tensor], SceneObjective], scene: Scene, field: HeightField, begun: Tensor, tolerances: Tolerances
+    objective: Callable[[Scene, Tensor], LossOfHeights], scene: Scene, field: HeightField, begun: Tensor, tolerances: Tolerances
 ) -> Mixture:
     """The loss over draws as a function of the heights; see above.  Its image is that without errors.
 
@@ -48,15 +49,15 @@ def robust_objective(
     surfaces = FormErrors(field, tolerances.form, tolerances.waviness) if fits else None
     rng, count = np.random.default_rng([tolerances.seed, PURPOSE, 1]), 2 * PAIRS
     seen = 1.0 / (count + 1)
-    cases = [Case(objective(scene, begun), 1.0 - WEIGHT, seen, 1.0)]
+    members = [Member(objective(scene, begun), 1.0 - WEIGHT, seen, 1.0)]
     for row in hypercube(parameters, PAIRS, tolerances.seed, PURPOSE):
         surface = surfaces.heights(rng, tolerances.surface) if surfaces else 0.0
         for sign in (-1.0, 1.0):
             values = {(p.error, p.axis): sign * float(v) for p, v in zip(parameters, row, strict=True)}
             errors = Misalignment.of(values)
             added = sign * surface + errors.thickness
-            cases.append(Case(objective(errors.upright(scene), begun + added), WEIGHT / count, seen, 0.0, added=added))
-    return Mixture(cases, POWER)
+            members.append(Member(objective(errors.upright(scene), begun + added), WEIGHT / count, seen, 0.0, added=added))
+    return Mixture(members, POWER)
 
 
 def _resolves(field: HeightField, shortest: float) -> bool:

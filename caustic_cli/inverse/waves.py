@@ -36,7 +36,7 @@ KEPT = 1 << 30
 
 
 @dataclass(frozen=True)
-class Part:
+class Contribution:
     """Light of one wavelength and one mode, a point of the source: phase (n, m) rad at h_0 in [0, 2 pi), its derivative with
     respect to the height (n, m) rad/mm, amplitude (n, m), masks of samples on pixels, and total power.
 
@@ -113,7 +113,7 @@ class WaveObjective:
                 phase, amplitude = imager.field(line, front, self.dtype)
                 slope = (TURN / line.length * front.sensitivity).to(self.dtype)
                 rows, columns = imager.masks(line, phase.device, self.dtype)
-                yield Part(line, k, front, phase, slope, amplitude, rows, columns, front.power())
+                yield Contribution(line, k, front, phase, slope, amplitude, rows, columns, front.power())
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value and gradient at heights (n, m) mm float64.
@@ -163,7 +163,7 @@ class WaveObjective:
         """Displacement of the surface at the intersections of the rays of a wavefront, (n, m) mm."""
         return self.field.evaluate(change, front.at_x.reshape(-1), front.at_y.reshape(-1))[0].view(front.at_x.shape)
 
-    def _image(self, part: Part, moved: Tensor) -> Tensor:
+    def _image(self, part: Contribution, moved: Tensor) -> Tensor:
         imager = self.imager
         if not imager.upright:
             front = replace(part.front, path=part.front.path + part.front.sensitivity * moved)
@@ -171,7 +171,7 @@ class WaveObjective:
         found = power_on_pixels(part.phase + part.slope * moved, part.amplitude, imager.sampling.padded, part.rows, part.columns)
         return imager.spread_out(found, part.mode)
 
-    def _channel(self, values: Tensor, part: Part) -> Tensor:
+    def _channel(self, values: Tensor, part: Contribution) -> Tensor:
         return values if part.line.channel is None else values[part.line.channel]
 
 

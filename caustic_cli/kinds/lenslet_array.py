@@ -15,7 +15,7 @@ from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.lenslets import NEEDS_DISTANT_SOURCE, array_objective, initial_array, lenslets
-from caustic_cli.inverse.problem import LossOfHeights
+from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.target import grey
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.surface import Described, OneSurface

@@ -12,8 +12,8 @@ from caustic_cli.config.default_stages import Table, refinement
 from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
-from caustic_cli.inverse.problem import LossOfHeights
 from caustic_cli.inverse.range_training import RangeAdam, RangeObjective
 from caustic_cli.inverse.scene_parameters import Range, Ranges
 from caustic_cli.kinds.defaults import Defaults

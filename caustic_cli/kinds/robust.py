@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from caustic_cli.config.settings import Settings
-from caustic_cli.inverse.problem import LossOfHeights
+from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.robust import robust_objective
 from caustic_cli.kinds.lenslet_array import LensletArray
 from caustic_cli.kinds.surface import Described, OneSurface

@@ -30,10 +30,10 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
-from caustic_cli.inverse.objective import Objective, SourceBlur
+from caustic_cli.inverse.objective import LossOfHeights, Objective, SourceBlur
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import FreeHeights, Heights
-from caustic_cli.inverse.problem import LossOfHeights, Problem, Skipped
+from caustic_cli.inverse.problem import Problem, Skipped
 from caustic_cli.inverse.reachability import refuse_unreachable
 from caustic_cli.inverse.sharpness import advice
 from caustic_cli.inverse.source_limits import (

@@ -16,8 +16,8 @@ from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.internal_rays import entrance_points
+from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.parametrisation import Heights, SidesTogether
-from caustic_cli.inverse.problem import LossOfHeights
 from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.kinds.defaults import Defaults

@@ -32,7 +32,7 @@ PIXELS, CONTROL = 48, 35
 RAYS_PER_PIXEL = 64
 
 
-class Candidate:
+class NetworkDesign:
     """A `studies.architectures.Candidate`: one design, or several for different parameter values with common columns.
 
     Args:
@@ -86,7 +86,7 @@ class Candidate:
 
 def candidates(
     project: Project | None, device: str, dtype: torch.dtype | None = None, seed: int | None = None, rays: int | None = None
-) -> list[Candidate]:
+) -> list[NetworkDesign]:
     """The grid for the picture and scene of a project, or without one for a bright disc; and its baselines.
 
     For a project whose network is trained over a range, all candidates are, from its initial surface and with its activation and
@@ -118,7 +118,7 @@ def candidates(
     base = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed, optimizer="adam")
     count = rays or RAYS_PER_PIXEL * math.prod(scene.screen.resolution)
 
-    def made(name: str, options: Options, inputs: str = "", each: list[OneSurface] | None = None) -> Candidate:
+    def made(name: str, options: Options, inputs: str = "", each: list[OneSurface] | None = None) -> NetworkDesign:
         how = options.parametrisation
         dense, shape = how.network == "dense", how.architecture
         about = {
@@ -132,7 +132,7 @@ def candidates(
             "lr": options.lr,
         }
         designers = [Designer(one.varied([stage], options)) for one in each or [problem]]
-        return Candidate(about, designers, first, problem.target.numpy(), count, base.seed)
+        return NetworkDesign(about, designers, first, problem.target.numpy(), count, base.seed)
 
     found, before = [], own.parametrisation
     outputs, activations = (OUTPUTS, ACTIVATIONS) if over is None else ((before.preconditioner,), (before.architecture.activation,))

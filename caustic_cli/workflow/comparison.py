@@ -18,8 +18,9 @@ from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import first_surface
+from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.parametrisation import Heights, Parametrisation
-from caustic_cli.inverse.problem import LossOfHeights, Options, Problem
+from caustic_cli.inverse.problem import Options, Problem
 from caustic_cli.inverse.schedule import Rendering, Stage
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.picture import Picture
