@@ -137,7 +137,7 @@ def test_gradient_of_the_loss_of_an_array():
         left = [abs(loss(heights + h * direction).loss - here.loss - h * slope) for h in steps]
         order = np.polyfit(np.log(steps), np.log(left), 1)[0]
         assert order == pytest.approx(2.0, abs=0.15), left
-    assert here.loss == pytest.approx(np.sqrt(np.mean([loss.each[k](p.of(heights)).loss ** 2 for k, p in enumerate(loss.parts)])))
+    assert here.loss == pytest.approx(np.sqrt(np.mean([one.objective(heights[one.where]).loss ** 2 for one in loss.members])))
 
 
 def hat(n=40):

@@ -53,16 +53,15 @@ def _not_by_default(s: Settings) -> str:
 def wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Table]:
     """Stages that refine the wave image after the ray image, on request or where diffraction matters."""
     design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
-    if asked == "on" and design["network"] != "none":
-        raise InputError("⟨design.waves⟩ on needs network none: the wave image is refined by control heights")
-    if asked == "on" and "gradient" in lens:
-        raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
-    if asked == "on" and source.rays is not None:
-        raise InputError("⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine")
-    if asked == "on" and build_screen(s).curved:
-        raise InputError("⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine")
-    if asked == "on" and len(source.members) > 1:
-        raise InputError("⟨design.waves⟩ on needs one source: light of several is refined by rays alone")
+    without = {
+        " needs network none: the wave image is refined by control heights": design["network"] != "none",
+        " needs a homogeneous lens: with a gradient index there is no wave image": "gradient" in lens,
+        ": a ray file contains no phase, so that it has no wave image to refine": source.rays is not None,
+        " needs a plane screen: a curved one has no wave image to refine": build_screen(s).curved,
+        " needs one source: light of several is refined by rays alone": len(source.members) > 1,
+    }
+    if asked == "on" and (why := [words for words, found in without.items() if found]):
+        raise InputError(f"⟨design.waves⟩ on{why[0]}")
     if asked == "off" or (asked == "auto" and _not_by_default(s)):
         return []
     seen = _resolution(s, source)

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -164,7 +165,12 @@ class Designer:
             deadline = began + time_limit
             if k < last and ahead and math.isfinite(time_limit):
                 deadline = began + time_limit * sum(costs[state.stage : k + 1]) / ahead
-            done = self._stage(state, k, limit, deadline, stop, on_iteration, notice, began - before)
+            end = partial(self._end, state, k, limit, deadline, stop)
+            try:
+                done = self._stage(state, k, end, on_iteration, notice, began - before)
+            except Skipped as skipped:
+                notice(f"stage {k + 1}: {skipped}")
+                state.reason, done = skipped.reason, True
             if not done or k == last:
                 break
             state = self._next(state, k + 1)
@@ -178,34 +184,35 @@ class Designer:
         """
         return self.problem.feasible(state.stage, state.heights)
 
-    def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, notice, origin: float) -> bool:
-        """Iterate stage k in place.  True: the stage is done; False: the whole design ends here, for `state.reason`."""
+    def _end(self, state: State, k: int, limit: int, deadline: float, stop: Callable[[], bool]) -> bool | None:
+        """Whether stage k is done (True), the whole design ends here for `state.reason` (False), or neither (None); decided from
+        the contents of a checkpoint alone but for time and signals, so that a resumed run decides alike."""
         stage, final = self.stages[k], k == len(self.stages) - 1
-        cap = math.inf if final else stage.iterations
+        if not final and state.iteration >= stage.iterations:
+            return True
+        if self._flat(state, stage.tolerance):
+            state.reason = "no progress"
+            return True
+        asked, late = (ranks.decide(said, self.problem.device) for said in (stop(), time.monotonic() >= deadline))
+        if state.total >= limit or asked:
+            state.reason = "interrupted" if asked else "iterations"
+            return False
+        if late and (state.iteration > 0 or final):
+            state.reason = "time limit"
+            return not final
+        return None
+
+    def _stage(self, state: State, k: int, end: Callable[[], bool | None], on_iteration, notice, origin: float) -> bool:
+        """Iterate stage k in place until its `end`.  True: the stage is done; False: the whole design ends here.
+
+        Raises:
+            Skipped: the stage cannot be done.
+        """
         method = heights = None
-        while True:
-            # Decided from the contents of a checkpoint alone, so that a resumed run decides alike.
-            if state.iteration >= cap:
-                return True
-            if self._flat(state, stage.tolerance):
-                state.reason = "no progress"
-                return True
-            asked, late = (ranks.decide(said, self.problem.device) for said in (stop(), time.monotonic() >= deadline))
-            if state.total >= limit or asked:
-                state.reason = "interrupted" if asked else "iterations"
-                return False
-            if late and (state.iteration > 0 or final):
-                state.reason = "time limit"
-                return not final
+        while (done := end()) is None:
             if method is None:
                 heights = self.module(state)
-                try:
-                    objective = self.objective(k, heights)
-                except Skipped as skipped:
-                    notice(f"stage {k + 1}: {skipped}")
-                    state.reason = skipped.reason
-                    return True
-                method = self.problem.optimiser(k)(objective, heights, self.options.lr)
+                method = self.problem.optimiser(k)(self.objective(k, heights), heights, self.options.lr)
                 if state.optimizer:
                     method.load(state.optimizer)
             told = method.rejected > 0
@@ -225,6 +232,7 @@ class Designer:
             state.history.append((state.total, k, method.loss, method.on_screen, state.seconds))
             state.parameters, state.optimizer, state.image = heights.state_dict(), method.state(), method.image
             on_iteration(state)
+        return done
 
     def objective(self, k: int, heights: Heights) -> LossOfHeights:
         """The objective of stage k, for heights near those of the parametrisation."""

@@ -111,31 +111,15 @@ def design_gradient_index(
     Raises:
         InputError: a source other than a plane wave, a mirror, or a range of index that is too small for the picture.
     """
-    lens, screen = scene.lens, scene.screen
+    lens = scene.lens
     low, high = limits or (lens.index - 0.05, lens.index + 0.05)
-    if not scene.source.collimated:
-        raise InputError("⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane")
-    if lens.mirror or scene.colored:
-        raise InputError("⟨lens.gradient⟩ free is designed for lenses, and for pictures without colours")
-    if not 1.0 <= low < high <= 5.0:
-        raise InputError(f"⟨lens.index_range⟩ must ascend within 1 to 5, got [{low:g}, {high:g}]")
-    if not lens.offset.thickness > lens.z_in:
-        raise InputError(f"⟨lens.thickness⟩ must lie behind the entrance at {lens.z_in:g} mm, got {lens.offset.thickness:g} mm")
-    net = HeightField.of(replace(lens, control=control, degree=(3, 3), knots=None, gradient=None))
-    layer = _start(scene, target, net, cells)
-    layer = layer - 0.5 * float(layer.min() + layer.max()) + 0.5 * (low + high)
-    spread, room = float(layer.max() - layer.min()), high - low
-    if spread > (1.0 - 2.0 * INSIDE) * room:
-        raise InputError(
-            f"⟨lens.index_range⟩ spans {room:.3g}, and this picture requires an index that varies by {spread:.3g};"
-            f" a thickness of {(lens.offset.thickness - lens.z_in) * 1.1 * spread / room:.3g} mm, or a smaller ⟨mag⟩, needs no more"
-        )
+    layer = _first_layer(scene, target, control, (low, high), cells)
 
     def volume(values: Tensor) -> SplineIndex:
         return SplineIndex(values, lens.half_size, lens.offset.thickness - lens.z_in)
 
     begun = volume(layer[:, :, None].expand(-1, -1, layers).contiguous())
-    objective = _IndexObjective(scene, target, begun, rays or RAYS_A_PIXEL * math.prod(screen.resolution), seed)
+    objective = _IndexObjective(scene, target, begun, rays or RAYS_A_PIXEL * math.prod(scene.screen.resolution), seed)
     low_net, high_net = (torch.full(control, v, dtype=torch.float64) for v in (low, high))
     nets = [FreeHeights(low_net, high_net, layer, laplacian=True) for _ in range(layers)]
     seen: dict[float, Evaluation] = {}
@@ -169,6 +153,29 @@ def design_gradient_index(
         on_iteration(k + 1, search.f, found.on_screen, found.image)
     with torch.no_grad():
         return GradientIndexDesign(volume(controls(search.x)), begun, tuple(history))
+
+
+def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], limits: tuple[float, float], cells: int) -> Tensor:
+    """Control values (n, m) of the initial index within its limits, independent of z; errors as of `design_gradient_index`."""
+    lens, (low, high) = scene.lens, limits
+    if not scene.source.collimated:
+        raise InputError("⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane")
+    if lens.mirror or scene.colored:
+        raise InputError("⟨lens.gradient⟩ free is designed for lenses, and for pictures without colours")
+    if not 1.0 <= low < high <= 5.0:
+        raise InputError(f"⟨lens.index_range⟩ must ascend within 1 to 5, got [{low:g}, {high:g}]")
+    if not lens.offset.thickness > lens.z_in:
+        raise InputError(f"⟨lens.thickness⟩ must lie behind the entrance at {lens.z_in:g} mm, got {lens.offset.thickness:g} mm")
+    net = HeightField.of(replace(lens, control=control, degree=(3, 3), knots=None, gradient=None))
+    layer = _start(scene, target, net, cells)
+    layer = layer - 0.5 * float(layer.min() + layer.max()) + 0.5 * (low + high)
+    spread, room = float(layer.max() - layer.min()), high - low
+    if spread > (1.0 - 2.0 * INSIDE) * room:
+        raise InputError(
+            f"⟨lens.index_range⟩ spans {room:.3g}, and this picture requires an index that varies by {spread:.3g};"
+            f" a thickness of {(lens.offset.thickness - lens.z_in) * 1.1 * spread / room:.3g} mm, or a smaller ⟨mag⟩, needs no more"
+        )
+    return layer
 
 
 class _IndexObjective(Objective):

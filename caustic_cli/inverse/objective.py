@@ -282,13 +282,9 @@ class Objective:
             ]
             if pulls:
                 values, pulled = zip(*pulls, strict=True)
-                for gradient, more in zip(gradients, torch.autograd.grad(values, leaves, pulled, allow_unused=True), strict=True):
-                    if more is not None:
-                        gradient += more
+                _add(gradients, torch.autograd.grad(values, leaves, pulled, allow_unused=True))
         ranks.all_reduce(*gradients)
-        for gradient, more in zip(gradients, direct, strict=True):
-            if more is not None:
-                gradient += more
+        _add(gradients, direct)
         inner = self.channels[0].inner(seen[0].detach())
         return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()), inner)
 
@@ -327,3 +323,10 @@ class Objective:
     def _penalty(self, parameters: Parameters) -> Tensor:
         """Weighted sum of squared penalties of the surfaces."""
         return self.penalty(parameters[EXIT])
+
+
+def _add(gradients: Sequence[Tensor], more: Sequence[Tensor | None]) -> None:
+    """Add to gradients in place, None for zero."""
+    for gradient, part in zip(gradients, more, strict=True):
+        if part is not None:
+            gradient += part

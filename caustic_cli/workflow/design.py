@@ -49,7 +49,7 @@ from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import wall_and_stock
 from caustic_cli.workflow.compilation import announce_compilation, compile_usual
 from caustic_cli.workflow.evaluation import evaluate_and_write, evaluation_seconds, expected_seconds
-from caustic_cli.workflow.movie import Movie
+from caustic_cli.workflow.movie import NoMovie
 from caustic_cli.workflow.reporter import Reporter
 
 #: Fraction of pixels brighter than NEARLY of the maximum above which a picture is taken for a drawing on white.
@@ -59,6 +59,7 @@ GROUND, NEARLY = 0.6, 0.98
 DONE = ("iterations", "no progress")
 #: Fractions of a time limit: least for the iterations, whatever the initial surface took; and most for the initial surface.
 LEAST_PART, START_PART = 0.25, 0.3
+NO_MOVIE = NoMovie()
 #: Time of a checkpoint, s, beyond which the interval to the next one grows, and the factor of the excess.
 QUICK, RARELY = 0.5, 10.0
 
@@ -262,7 +263,7 @@ class Result:
     figures: dict[str, Any]
 
 
-def design(begun: Begun, device: str, say: Reporter, began: float, movie: Movie | None = None) -> Result:
+def design(begun: Begun, device: str, say: Reporter, began: float, movie: NoMovie = NO_MOVIE) -> Result:
     """Run a new design from its initial heights to its end; movie: records it.
 
     A finished design found by `begin` is returned; an unfinished one is continued.
@@ -277,7 +278,7 @@ def design(begun: Begun, device: str, say: Reporter, began: float, movie: Movie 
         return _run(project, problem, Designer(problem).begin(*first or ()), say, began, None, movie)
 
 
-def _again(project: Project, device: str, say: Reporter, began: float, movie: Movie | None) -> Result:
+def _again(project: Project, device: str, say: Reporter, began: float, movie: NoMovie) -> Result:
     """The result of a design found by `begin`."""
     figures = uptodate.finished(project, project.found)
     anew = kind_of(project.settings).no_resume
@@ -297,8 +298,7 @@ def _again(project: Project, device: str, say: Reporter, began: float, movie: Mo
         return design(Begun(project, problem_of(project, device)), device, say, began)
     if not figures:
         return resume(project, None, None, device, say, began, movie)
-    if movie is not None:
-        say.say(f"{movie.path}: is not written, since no design was run")
+    movie.unused(say)
     scene = project.scene()
     target = project.target(scene)
     scene, field, heights, checkpoint = project.lens(scene)
@@ -326,7 +326,7 @@ def resume(
     device: str,
     say: Reporter,
     began: float,
-    movie: Movie | None = None,
+    movie: NoMovie = NO_MOVIE,
 ) -> Result:
     """Continue from the last checkpoint; with nothing left to do, evaluate the lens again."""
     with project.hold:
@@ -464,7 +464,7 @@ def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:
 class _Watch:
     """Called after every iteration of a design: progress, movie and checkpoints."""
 
-    def __init__(self, project: Project, designer: Designer, records: _Records, say: Reporter, movie: Movie | None):
+    def __init__(self, project: Project, designer: Designer, records: _Records, say: Reporter, movie: NoMovie):
         self.designer, self.records, self.say, self.movie = designer, records, say, movie
         self.chosen, self.encoding = project.settings["design"], project.settings["target"]["encoding"]
         self.target = designer.problem.target.numpy()
@@ -480,8 +480,7 @@ class _Watch:
             self.say.say(f"{name}: {stage.control[0]} x {stage.control[1]} control points, {stage.light}")
         _, _, loss, on_screen, _ = now.history[-1]
         self.show(name, f"loss {loss * grey(self.target).size:.4f}  on screen {on_screen:.1%}", now.total, self.total)
-        if self.movie is not None:
-            self.movie.record(now, self.target, self.encoding, bool(stage.waves))
+        self.movie.record(now, self.target, self.encoding, bool(stage.waves))
         self.keep_if_due(now)
 
     def keep_if_due(self, now: State) -> None:
@@ -498,7 +497,7 @@ def _run(
     say: Reporter,
     began: float,
     time_limit: float | None,
-    movie: Movie | None = None,
+    movie: NoMovie = NO_MOVIE,
 ) -> Result:
     chosen, designer = project.settings["design"], Designer(problem)
     limit = chosen["time_limit"] if time_limit is None else time_limit
@@ -507,8 +506,7 @@ def _run(
         limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - expected_seconds(designer, state))
     records = _Records(project, designer)
     watch = _Watch(project, designer, records, say, movie)
-    if movie is not None:
-        movie.screen = problem.scene.screen
+    movie.begin(problem.scene.screen)
     with _signals(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
             records.keep(state)
@@ -526,8 +524,7 @@ def _run(
                 state = replace(state, start=start, unrounded=sharp, parameters={}, optimizer={})
             if asked:
                 records.keep(state)
-                if movie is not None:
-                    movie.write()
+                movie.write()
                 raise Interrupted(
                     f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
                     f" caustic design ⟨resume⟩ {project.path} continues it",
@@ -539,11 +536,8 @@ def _run(
             found = evaluate_and_write(project, designer, state, timed)
         made = wall_and_stock(problem.scene, designer.field(found.state.stage), designer.exit(found.state))
         result = _finished(project, designer, found, made, began, records)
-        if movie is not None:
-            movie.finish(found.image if found.waves is None else found.waves, found.figures)
-            movie.write()
-            say.say(f"{movie.path}: {len(movie.frames)} frames of the design")
-            result = replace(result, figures=result.figures | {"movie": str(movie.path)})
+        shown = found.image if found.waves is None else found.waves
+        result = replace(result, figures=result.figures | movie.finish(shown, found.figures, say))
         if asked:
             raise Interrupted(f"interrupted after the design had ended; {project.path} is complete", 128 + asked[0])
     if not timed and (words := problem.advice(tuple(project.settings["target"]["size"]))):

@@ -38,7 +38,7 @@ from caustic_cli.scene import Scene
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.lens import Lens, Render, count, load
-from caustic_cli.workflow.movie import Movie
+from caustic_cli.workflow.movie import recorder
 from caustic_cli.workflow.reporter import Listener, Reporter
 
 #: Progress callback of a design: stage, status, iterations done, and in total.
@@ -133,7 +133,7 @@ def design_of(
     Raises:
         InputError, CausticError: as in `design`.
     """
-    began, recorder = time.monotonic(), None if movie is None else Movie(movie, force)
+    began, recording = time.monotonic(), recorder(movie, force)
     begun = workflow.begin(
         Path(target) if isinstance(target, str) else target,
         given,
@@ -141,12 +141,12 @@ def design_of(
         config=config,
         out=out,
         force=force,
-        recorded=recorder is not None,
+        recorded=recording.recorded,
         say=say,
         device=device,
     )
     compile_for(begun.scene, device, say, gradient=True)
-    return _lens(workflow.design(begun, device, say, began, recorder), device)
+    return _lens(workflow.design(begun, device, say, began, recording), device)
 
 
 def resume(
@@ -168,10 +168,10 @@ def resume(
     Raises:
         InputError: there is no project, or it was edited into another design.
     """
-    began, say, recorder = time.monotonic(), say or Listener(), None if movie is None else Movie(movie, force)
+    began, say, recording = time.monotonic(), say or Listener(), recorder(movie, force)
     project = Project.open(path)
     compile_for(project.scene(), device, say, gradient=True)
-    return _lens(workflow.resume(project, iterations, time_limit, device, say, began, recorder), device)
+    return _lens(workflow.resume(project, iterations, time_limit, device, say, began, recording), device)
 
 
 def _lens(done: workflow.Result, device: str) -> Lens:

@@ -21,6 +21,7 @@ from caustic_cli.scene import Screen
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import white_level
+from caustic_cli.workflow.reporter import Reporter
 
 #: Most frames; for a longer design every second, fourth, ... iteration is kept.
 MOST = 160
@@ -38,8 +39,31 @@ class Frame:
     words: tuple[str, str]
 
 
+class NoMovie:
+    """What a design asks of its recording, where none is made."""
+
+    recorded = False
+
+    def begin(self, screen: Screen) -> None:
+        """Record images on this screen, by whose pixel areas power is converted to irradiance."""
+
+    def record(self, state: State, target: np.ndarray, encoding: str, waves: bool) -> None:
+        """Record the image of the last iteration; waves: whether it is a wave image."""
+
+    def finish(self, image: np.ndarray, figures: dict[str, Any], say: Reporter) -> dict[str, str]:
+        """Record the image of the finished lens with the figures of its evaluation, as the last frame, and write; the figures of
+        the recording."""
+        return {}
+
+    def write(self) -> None:
+        """Write the file atomically; none if nothing was recorded."""
+
+    def unused(self, say: Reporter) -> None:
+        """Report that no design was run."""
+
+
 @dataclass(eq=False)
-class Movie:
+class Movie(NoMovie):
     """Records a design.
 
     Args:
@@ -49,6 +73,7 @@ class Movie:
         InputError: it could not be written, see `io.movie.refuse_unwritable`.
     """
 
+    recorded = True
     path: Path
     force: bool = False
     frames: list[Frame] = field(default_factory=list)
@@ -59,11 +84,12 @@ class Movie:
         self._target: np.ndarray | None = None
         self._encoding = "srgb"
         self._last = ""
-        #: Screen whose pixel areas convert power to irradiance.
         self.screen: Screen | None = None
 
+    def begin(self, screen: Screen) -> None:
+        self.screen = screen
+
     def record(self, state: State, target: np.ndarray, encoding: str, waves: bool) -> None:
-        """Record the image of the last iteration; waves: whether it is a wave image."""
         self._target, self._encoding, self._seen = target, encoding, self._seen + 1
         total, stage, _, _, seconds = state.history[-1]
         self._last = f"iteration {total}, {seconds:.1f} s"
@@ -75,14 +101,18 @@ class Movie:
         how = "wave image" if waves else "the rays of the design"
         self._add(image, f"stage {stage + 1}, {self._last}", f"relative RMS error {self._error(image):.3f}, by {how}")
 
-    def finish(self, image: np.ndarray, figures: dict[str, Any]) -> None:
-        """Record the image of the finished lens with the figures of its evaluation, as the last frame."""
+    def finish(self, image: np.ndarray, figures: dict[str, Any], say: Reporter) -> dict[str, str]:
         how = "independent wave image" if figures["error_by"] == "waves" else f"{figures['rays']:,} independent rays"
         words = f"relative RMS error {figures['error']:.3f}, {how}"
         self._add(image, f"finished after {self._last}" if self._last else "finished", words)
+        self.write()
+        say.say(f"{self.path}: {len(self.frames)} frames of the design")
+        return {"movie": str(self.path)}
+
+    def unused(self, say: Reporter) -> None:
+        say.say(f"{self.path}: is not written, since no design was run")
 
     def write(self) -> None:
-        """Write the file atomically; none if nothing was recorded."""
         if self.frames:
             each = min(max(LENGTH // len(self.frames), LEAST), LONGEST)
             shown = [_drawn(frame) for frame in self.frames]
@@ -98,6 +128,11 @@ class Movie:
         if self.screen is not None:
             image, target = irradiance(image, self.screen), None if target is None else irradiance(target, self.screen)
         self.frames.append(Frame(codes_of(image, white_level(image, target), self._encoding), (words[0], words[1])))
+
+
+def recorder(path: Path | None, force: bool) -> NoMovie:
+    """The recording of a design at `path`, or none."""
+    return NoMovie() if path is None else Movie(path, force)
 
 
 def _drawn(frame: Frame) -> Image.Image:
