@@ -20,6 +20,7 @@ from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.lbfgs import UNFIT
 from caustic_cli.inverse.objective import LossOfHeights
+from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import Heights
 from caustic_cli.inverse.problem import Problem, Skipped
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -103,7 +104,9 @@ class Designer:
 
     def begun(self, state: State, rounded: bool = True) -> Tensor:
         """The initial surface on the control net of the current stage (n, m), mm; or the `unrounded` one."""
-        return self._carried(state.start if rounded else state.unrounded, 0, state.stage)
+        heights = state.start if rounded else state.unrounded
+        assert heights is not None
+        return self._carried(heights, 0, state.stage)
 
     def showing(self, state: State, heights: Tensor) -> State:
         """A state whose lens is `heights`, while the parameters of the optimiser are unchanged; `restored` undoes it."""
@@ -208,7 +211,7 @@ class Designer:
         Raises:
             Skipped: the stage cannot be done.
         """
-        method = heights = None
+        method: Adam | QuasiNewton | None = None
         while (done := end()) is None:
             if method is None:
                 heights = self.module(state)

@@ -16,7 +16,7 @@ import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -96,16 +96,17 @@ class SourceBlur:
     @property
     def beside(self) -> tuple[int, int]:
         """Pixels of the margin along each axis."""
-        return tuple(n // self.cut for n in self.spread[0].beside) if self.spread else (0, 0)
+        x, y = self.spread[0].beside if self.spread else (0, 0)
+        return x // self.cut, y // self.cut
 
     def spread_out(self, images: Tensor) -> Tensor:
         """The image on screen and apron of the whole source, from those of its points."""
         if not self.spread:
             return images[0]
-        return sum(
-            torch.stack([spread(c) for c in image]) if image.ndim == 3 else spread(image)
-            for spread, image in zip(self.spread, images, strict=True)
-        )
+        total: Tensor | int = 0
+        for spread, image in zip(self.spread, images, strict=True):
+            total = total + (torch.stack([spread(c) for c in image]) if image.ndim == 3 else spread(image))
+        return cast(Tensor, total)
 
     def expected_power(self, seen: Tensor, leaving: Tensor) -> Tensor:
         """Power to which the loss normalises an image: all that leaves the lens; with a blur that in the image, but at least what
@@ -113,7 +114,7 @@ class SourceBlur:
         return torch.maximum(seen.sum((-2, -1)), self.expected * leaving) if self.spread else leaving
 
 
-SHARP = SourceBlur()
+UNBLURRED = SourceBlur()
 
 
 class Channel:
@@ -124,10 +125,11 @@ class Channel:
         loss: weighted terms, see `losses.parse`; how: see `Rendering`; blur: of the source.
     """
 
-    def __init__(self, screen: Screen, target: Tensor, loss: str, how: Rendering, blur: SourceBlur = SHARP):
+    def __init__(self, screen: Screen, target: Tensor, loss: str, how: Rendering, blur: SourceBlur = UNBLURRED):
         self.how, self.cut = how, blur.cut
-        grown = screen.grown(tuple(how.apron + n for n in blur.beside))
-        self.screen = replace(grown, resolution=tuple(how.oversample * n for n in grown.resolution))
+        grown = screen.grown((how.apron + blur.beside[0], how.apron + blur.beside[1]))
+        nx, ny = grown.resolution
+        self.screen = replace(grown, resolution=(how.oversample * nx, how.oversample * ny))
         wide = torch.nn.functional.pad(target.double(), (how.apron,) * 4)
         smooth = wide
         if how.filter_target:
@@ -185,7 +187,7 @@ class Objective:
         how: Rendering | None = None,
         limits: Limits | None = None,
         *,
-        blur: SourceBlur = SHARP,
+        blur: SourceBlur = UNBLURRED,
         dtype: torch.dtype = torch.float32,
     ):
         self.samplers = list(sampler) if isinstance(sampler, Sequence) else [sampler]
@@ -298,17 +300,16 @@ class Objective:
         with torch.set_grad_enabled(self.whole):
             for k, traced in self.kept or self._tracers():
                 part = self._see(traced, parameters)
-                for total, more in zip(self._of_point(sums, k), part, strict=True):
-                    total += more.detach()
+                _add(self._of_point(sums, k), [more.detach() for more in part])
                 entering = entering + traced.entering.double()
                 if self.whole:
                     parts.append((k, part))
         return sums, entering, parts
 
-    def _of_point(self, values: Sequence[Tensor | None], k: int) -> list[Tensor | None]:
-        """Of accumulated values, or their derivatives, those of source point k."""
+    def _of_point(self, values: Sequence[Tensor], k: int) -> list[Tensor]:
+        """Of accumulated values, or their derivatives, which may be None, those of source point k."""
         count = len(self.channels)
-        return [None if value is None else value[k] for value in values[:count]] + list(values[count:])
+        return [value if value is None else value[k] for value in values[:count]] + list(values[count:])
 
     def _see(self, traced: Tracer, parameters: Parameters) -> list[Tensor]:
         """Contribution of a chunk to the image of each channel, the power that leaves the lens, and further sums over rays."""
@@ -325,8 +326,8 @@ class Objective:
         return self.penalty(parameters[EXIT])
 
 
-def _add(gradients: Sequence[Tensor], more: Sequence[Tensor | None]) -> None:
-    """Add to gradients in place, None for zero."""
-    for gradient, part in zip(gradients, more, strict=True):
+def _add(values: Sequence[Tensor], more: Sequence[Tensor | None]) -> None:
+    """Add to values in place, None for zero."""
+    for value, part in zip(values, more, strict=True):
         if part is not None:
-            gradient += part
+            value += part

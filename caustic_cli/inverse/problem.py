@@ -166,7 +166,7 @@ class Problem:
     # Optimisation
 
     #: Number of inputs of a network beside the 1.
-    inputs = 0
+    inputs: int = 0
 
     def parametrised(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
         """The parametrisation of stage k from initial heights, if any; loaded: its tensors are loaded afterwards."""

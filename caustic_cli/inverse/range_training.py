@@ -52,7 +52,7 @@ class RangeObjective:
         seeds = [stream(self.seed, f"rays {k} of iteration {iteration}") for k in range(BATCH)]
         return [self.middle.moved(scene, self.rays(scene, seed)) for scene, seed in zip(scenes, seeds, strict=True)]
 
-    def __call__(self, heights: Tensor, iteration: int) -> Evaluation:
+    def __call__(self, heights: Tensor, iteration: int = 0) -> Evaluation:
         """Mean loss, its gradient (k, n, m), mean fraction of the light on the screen and mean image, of heights (k, n, m) mm at
         the parameter values of an iteration."""
         part = 1.0 / BATCH

@@ -39,7 +39,7 @@ class NetworkOverRange(OneSurface):
     one_scene = False
 
     def __init__(self, *args: Any, ranges: Ranges, conditioned: bool = True, **more: Any):
-        self.ranges, self.conditioned = ranges, conditioned
+        self.ranges, self.inputs = ranges, len(ranges.each) if conditioned else 0
         super().__init__(*args, **more)
 
     @classmethod
@@ -78,10 +78,6 @@ class NetworkOverRange(OneSurface):
         """Those at all combinations of the ends of the ranges."""
         return self.ranges.ends(self.scene)
 
-    @property
-    def inputs(self) -> int:
-        return len(self.ranges.each) if self.conditioned else 0
-
     def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
         return RangeAdam
 
@@ -95,7 +91,7 @@ class NetworkOverRange(OneSurface):
     def blind(self, values: Sequence[float] | None = None) -> NetworkOverRange:
         """The same with a single lens for all, or in the scene at these values alone."""
         other = copy.copy(self)
-        other.conditioned = False
+        other.inputs = 0
         if values is not None:
             other.scene = self.ranges.scene(self.scene, values)
             other.ranges = Ranges(tuple(Range(k, v, v) for k, v in zip(self.ranges.keys, values, strict=True)))

@@ -396,8 +396,11 @@ class OneSurface(Problem):
 
     #: Rays of an evaluation.
     final_rays = FINAL_RAYS
-    #: Retraces of an evaluation beyond those of one scene, in the time of one.
-    further_retraces = 0.0
+
+    @property
+    def further_retraces(self) -> float:
+        """Retraces of an evaluation beyond those of one scene, in the time of one."""
+        return 0.0
 
     def evaluate(self, designer: Designer, state: State, size: tuple[float, float], timed: bool = False) -> Evaluated:
         """Retrace the finished lens with independent rays, and compute its wave image if that was refined.

@@ -116,7 +116,7 @@ class TwoSides(SeveralSurfaces):
 
         def trace(heights: Tensor, rays: int) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
             scene, exit = split_heights(self.scene, field, heights)
-            how = {"rays": rays, "device": self.device, "seed": seed}
+            how: dict[str, Any] = {"rays": rays, "device": self.device, "seed": seed}
             exposure, figures = retrace(scene, field, exit, target, noise=rays == final, **how)
             second, more = second_figures(scene, field, exit, farther, **how)
             return exposure.image.cpu().numpy(), second, figures | more

@@ -96,29 +96,52 @@ def candidates(
     Raises:
         InputError: no stage is on rays, or there are two free-form sides.
     """
-    first: InitialHeights | None = None
-    if project is None:
-        full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
-        project = Project(None, full, Picture(picture_of_disc(), "linear"))
-    over = project.over
-    full = {key: value for key, value in project.settings["design"].items() if key != "robust"}
-    project = replace(project, settings=project.settings | {"design": full})
-    problem = problem_of(project, device)
-    if over is not None and full["start"] != "offset":
-        _, adapted, first = first_heights(project, project.settings, problem)
-        problem = adapted or problem
-    scene, stages, own = problem.scene, [s for s in problem.stages if not s.waves], problem.options
-    if not stages or scene.second is not None or scene.lens.arrayed:
-        raise InputError(
-            "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
-        )
-    last = stages[-1]
-    how = replace(last.rendering, blur=0.0)
-    stage = replace(last, rendering=how, iterations=10**9, tolerance=0.0, source=None, spread=False, control=scene.lens.control)
-    base = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed, optimizer="adam")
-    count = rays or RAYS_PER_PIXEL * math.prod(scene.screen.resolution)
+    study = _Study(project, device, dtype, seed, rays)
+    own, over = study.own, study.over
+    base, before, found = replace(own, optimizer="adam"), own.parametrisation, []
+    outputs, activations = (OUTPUTS, ACTIVATIONS) if over is None else ((before.preconditioner,), (before.architecture.activation,))
+    for output, lr, act, layers, width in itertools.product(outputs, RATES, activations, LAYERS, WIDTHS):
+        network = Parametrisation("dense", "zero-last", output, Architecture(layers, width, act))
+        options = replace(base, parametrisation=network, lr=lr)
+        found.append(study.design(f"{layers} x {width} {act}", options, "" if over is None else "range"))
+    if over is None:
+        for output, lr in itertools.product(OUTPUTS, FREE_RATES):
+            free = replace(base, parametrisation=Parametrisation(preconditioner=output), lr=lr)
+            found.append(study.design("no network", free))
+        return found
+    blind = study.problem.blind
+    found.append(study.design("as designed", own, "range"))
+    found.append(study.design("one lens for all", own, "none", [blind()]))
+    found.append(study.design("each value alone", own, "alone", [blind(values) for values in over.evaluation_points()]))
+    return found
 
-    def made(name: str, options: Options, inputs: str = "", each: list[OneSurface] | None = None) -> NetworkDesign:
+
+class _Study:
+    """The problem of a project, or of a bright disc without one, and designs of it on the rays of its last stage alone."""
+
+    def __init__(self, project: Project | None, device: str, dtype: torch.dtype | None, seed: int | None, rays: int | None):
+        if project is None:
+            full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
+            project = Project(None, full, Picture(picture_of_disc(), "linear"))
+        chosen = {key: value for key, value in project.settings["design"].items() if key != "robust"}
+        project = replace(project, settings=project.settings | {"design": chosen})
+        self.over = project.over
+        self.problem, self.first = problem_of(project, device), None
+        if self.over is not None and chosen["start"] != "offset":
+            _, self.problem, self.first = first_heights(project, project.settings, self.problem)
+        scene, stages, own = self.problem.scene, [s for s in self.problem.stages if not s.waves], self.problem.options
+        if not stages or scene.second is not None or scene.lens.arrayed:
+            raise InputError(
+                "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
+            )
+        last, control = stages[-1], scene.lens.control
+        how = replace(last.rendering, blur=0.0)
+        self.stage = replace(last, rendering=how, iterations=10**9, tolerance=0.0, source=None, spread=False, control=control)
+        self.own = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed)
+        self.count = rays or RAYS_PER_PIXEL * math.prod(scene.screen.resolution)
+
+    def design(self, name: str, options: Options, inputs: str = "", each: list[OneSurface] | None = None) -> NetworkDesign:
+        """A design with these options, or one of each problem."""
         how = options.parametrisation
         dense, shape = how.network == "dense", how.architecture
         about = {
@@ -126,26 +149,10 @@ def candidates(
             "network": how.network,
             "inputs": inputs,
             "layers": shape.layers if dense else None,
-            "width": (shape.width or math.prod(scene.lens.control)) if dense else None,
+            "width": (shape.width or math.prod(self.stage.control)) if dense else None,
             "activation": shape.activation if dense else None,
             "preconditioner": how.preconditioner,
             "lr": options.lr,
         }
-        designers = [Designer(one.varied([stage], options)) for one in each or [problem]]
-        return NetworkDesign(about, designers, first, problem.target.numpy(), count, base.seed)
-
-    found, before = [], own.parametrisation
-    outputs, activations = (OUTPUTS, ACTIVATIONS) if over is None else ((before.preconditioner,), (before.architecture.activation,))
-    for output, lr, act, layers, width in itertools.product(outputs, RATES, activations, LAYERS, WIDTHS):
-        network = Parametrisation("dense", "zero-last", output, Architecture(layers, width, act))
-        options = replace(base, parametrisation=network, lr=lr)
-        found.append(made(f"{layers} x {width} {act}", options, "" if over is None else "range"))
-    if over is None:
-        for output, lr in itertools.product(OUTPUTS, FREE_RATES):
-            found.append(made("no network", replace(base, parametrisation=Parametrisation(preconditioner=output), lr=lr)))
-        return found
-    again = replace(own, dtype=base.dtype, seed=base.seed)
-    found.append(made("as designed", again, "range"))
-    found.append(made("one lens for all", again, "none", [problem.blind()]))
-    found.append(made("each value alone", again, "alone", [problem.blind(values) for values in over.evaluation_points()]))
-    return found
+        designers = [Designer(one.varied([self.stage], options)) for one in each or [self.problem]]
+        return NetworkDesign(about, designers, self.first, self.problem.target.numpy(), self.count, options.seed)
