@@ -56,7 +56,7 @@ aim_batch, pull_batch, push_oblique = device(oblique._aim), device(oblique._pull
 VECTORS = axial_refraction.VECTORS + axial_refraction.SCRATCH
 
 
-class Setting(NamedTuple):
+class KernelArguments(NamedTuple):
     """Scalar arguments of a kernel: index and kind of Fresnel losses, as of an `Exit`, a `Frame`, and alpha of the filter."""
 
     index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
@@ -67,7 +67,7 @@ class Setting(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class DeviceRays:
     """Rays below the exit, (N,) each on the device: origins, mm, transverse direction components, and powers.
 
     oblique: whether they have individual directions; otherwise all are parallel to z, and `along` is empty.
@@ -237,16 +237,16 @@ class Splatting(NamedTuple):
     """All inputs except the intersections: light, unit of its sums, start and height of the `Exit` (2,), kernels and their
     arguments."""
 
-    light: Light
+    light: DeviceRays
     unit: Tensor
     place: Tensor
-    setting: Setting
+    setting: KernelArguments
     kernels: tuple
     shape: tuple[int, int]
 
 
 def expose(
-    hits, light: Light, unit: Tensor, place: Tensor, eta: float, fresnel: str, screen: Screen, filter: Filter
+    hits, light: DeviceRays, unit: Tensor, place: Tensor, eta: float, fresnel: str, screen: Screen, filter: Filter
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """The image of rays, from where they meet the exit.
 
@@ -261,7 +261,7 @@ def expose(
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     vx, vy, kind = 2 * rx + 1, 2 * ry + 1, filter_weights.KINDS[filter.kind]
     frame = Frame(int(nx), int(ny), *map(float, screen.low), *map(float, screen.pixel))
-    setting = Setting(float(eta), axial_refraction.FRESNEL[fresnel], frame, *map(float, filter.alpha))
+    setting = KernelArguments(float(eta), axial_refraction.FRESNEL[fresnel], frame, *map(float, filter.alpha))
     shape = (nx + 4 * rx, ny + 4 * ry + -vy % 4)  # with room for the gather's steps of four pixels
     how = Splatting(light, unit, place, setting, _kernels(light.oblique, kind, vx, vy), shape)
     padded, leaving, ledger = _Image.apply(*hits, how)
