@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from caustic_cli.config import presets, settings
-from caustic_cli.config.completion import Derivation, complete, without_waves
-from caustic_cli.config.settings import Settings, value_of
+from caustic_cli.config.completion import complete, without_waves
+from caustic_cli.config.settings import Given, Settings
+from caustic_cli.config.table import Parameters, TargetSettings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.io.files import Piped
@@ -25,7 +26,7 @@ def new_project(
     config: Path | None,
     out: Path | None,
     say: Callable[[str], None],
-) -> tuple[Project, Settings]:
+) -> tuple[Project, Given]:
     """A project, of which nothing is written yet, and the settings that were given, by section.
 
     Args:
@@ -37,80 +38,49 @@ def new_project(
     Raises:
         InputError: invalid input.
     """
-    read = [settings.read(path, parameters=True) for path in (preset and presets.path_of(preset), config) if path]
-    if config and "source" in read[-1]:
-        read[-1]["source"] = attachments.attached(read[-1]["source"], config.parent)
-    if config and "design" in read[-1]:
-        read[-1]["design"] = attachments.with_errors(read[-1]["design"], config.parent)
-    if config and "screen" in read[-1]:
-        read[-1]["screen"] = attachments.with_shape(read[-1]["screen"], config.parent)
-    if config and "lens" in read[-1]:
-        read[-1]["lens"] = attachments.with_index(read[-1]["lens"], config.parent)
-    chosen = settings.by_section(given)
-    said = settings.merged({}, *map(settings.implied, (*read, chosen)))
-    if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given at the same level
-        glass = said["lens"].pop("glass")
-        say(f"⟨lens.index⟩ {said['lens']['index']:g} is used at all wavelengths, and {glass} is ignored")
-    if "design" in said:
-        said["design"] = attachments.with_errors(said["design"])
-    if "screen" in said:
-        said["screen"] = attachments.with_shape(said["screen"])
-    parameters = said.pop("", {})
-    invert = parameters.pop("invert", False)
-    if "elements" in parameters:  # those of the command line replace those of a configuration
-        said["element"] = {"list": parameters.pop("elements")}
-    by = Derivation(**parameters)
-    if "source" in said:
-        said["source"] = attachments.attached(said["source"])
-    if "lens" in said:
-        said["lens"] = attachments.with_index(said["lens"])
-    goal = said.get("target", {})
+    said = _merged(given, preset, config, say)
+    parameters = Parameters(said.pop("", {}))
+    if parameters.elements is not None:  # those of the command line replace those of a configuration
+        said["element"] = {"list": list(parameters.elements)}
+    goal = TargetSettings.of(said.get("target", {}))
     picture = (
-        target
-        if isinstance(target, Picture)
-        else read_picture(target, goal.get("encoding") == "linear", goal.get("color", False), invert)
+        target if isinstance(target, Picture) else read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
     )
     if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
         del said["source"]["weights"]
-    if goal.get("color", False):
+    if goal.color:
         if isinstance(target, Picture):
             raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
         light = [float(c) for c in picture.irradiance().sum((1, 2))]
         said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
-    profile = said.get("source", {}).get("profile")
-    light = read_picture((config.parent if config else Path()) / profile, linear=True) if profile else None
-    full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
+    full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
     for key in ("index_range", "index_control", "index_layers"):
-        if f"lens.{key}" in given and full["lens"].get("gradient") != "free":
+        if f"lens.{key}" in given and full.lens.gradient != "free":
             raise InputError(f"⟨lens.{key}⟩ belongs to ⟨+lens.gradient⟩ free")
-    if value_of(full["lens"], "lens.mirror") and "shift" not in full["screen"] and any(shift := _beside_the_light(full)):
+    if full.lens.mirror and "shift" not in full.screen and any(shift := _beside_the_light(full)):
         said["screen"] = said.get("screen", {}) | {"shift": list(shift)}
-        full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
+        full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
         say(f"the screen is shifted by {shift[0]:g},{shift[1]:g} mm, beside the light of its source; ⟨+screen.shift⟩ places it")
-    settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
-    farther = full.get("second", {}).get("file")
-    second = None
-    if farther:
-        at = config.parent if config and "file" not in chosen.get("second", {}) else Path()
-        second = read_picture(at / farther, goal.get("encoding") == "linear", False, invert)
-        full["second"]["file"] = f"second{second.suffix}"
-    full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
-    if light is not None:
-        full["source"]["profile"] = f"profile{light.suffix}"
-    attachments.named_in_project(full)
-    made = Project(
-        out,
-        full,
-        picture,
-        light,
-        second,
-        uptodate.digest(full, picture, light, second),
-        without_waves=without_waves(full, "stages" in said.get("design", {})),
-    )
-    return made, said
+    settings.refuse_unused(full.source, given, [stage.source for stage in full.design.stages])
+    full = full.changed(target=full.target.changed(file=f"target{picture.suffix}", encoding=picture.encoding))
+    full = attachments.named_in_project(full)
+    asked = uptodate.digest(full, picture)
+    return Project(out, full, picture, asked, without_waves=without_waves(full, "stages" in said.get("design", {}))), said
+
+
+def _merged(given: Mapping[str, Any], preset: str | None, config: Path | None, say: Callable[[str], None]) -> Given:
+    """The settings of preset, configuration and command line, with the contents of the files they name."""
+    layers = [settings.read(presets.path_of(preset), parameters=True)] if preset else []
+    if config:
+        layers.append(attachments.located(settings.read(config, parameters=True), config.parent))
+    said = settings.merged({}, *map(settings.implied, (*layers, settings.by_section(given))))
+    if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given at the same level
+        glass = said["lens"].pop("glass")
+        say(f"⟨lens.index⟩ {said['lens']['index']:g} is used at all wavelengths, and {glass} is ignored")
+    return attachments.attached(said)
 
 
 def _beside_the_light(full: Settings) -> tuple[float, float]:
     """Shift (x, y) mm of a mirror's screen with which it is nowhere in the light of its source; 0 if there is none."""
-    scene, over = settings.build_scene(full), Ranges.parse(value_of(full["design"], "design.over"))
+    scene, over = settings.build_scene(full), Ranges.parse(full.design.over)
     return clear_shift([scene] if over is None else over.ends(scene)) or (0.0, 0.0)

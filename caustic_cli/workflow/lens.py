@@ -124,19 +124,19 @@ class Lens:
     @property
     def seed(self) -> int:
         """Seed of the rays of its design."""
-        return 0 if self.project is None else self.project.settings["design"]["seed"]
+        return 0 if self.project is None else self.project.settings.design.seed
 
     @property
     def by_waves(self) -> bool:
         """Whether its design was refined on its wave image, which then judges it."""
         if self.project is None or self.state is None:
             return False
-        return any(stage.get("waves") for stage in self.project.settings["design"]["stages"][: self.state.stage + 1])
+        return any(stage.waves for stage in self.project.settings.design.stages[: self.state.stage + 1])
 
     @property
     def encoding(self) -> str:
         """Encoding of its picture, and of its images."""
-        return "srgb" if self.project is None else self.project.settings["target"]["encoding"]
+        return "srgb" if self.project is None else self.project.settings.target.encoding
 
     def plan(self, effects: str = "auto", steeper: float = 0.0) -> Plan:
         """The effects to simulate: those that the scene calls for ("auto"), only those that cannot be left out ("none"), or those
@@ -224,7 +224,7 @@ class Lens:
         """Resolution of the scene by diffraction."""
         if self.project is None:
             return Resolution.at(scene, self.field, self.heights)
-        return Resolution.before(scene, tuple(self.project.settings["target"]["size"]))
+        return Resolution.before(scene, self.project.settings.target.size)
 
     def export(
         self,
