@@ -27,6 +27,7 @@ from caustic_cli.inverse.target import target_on_screen, tiles
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.optics.bounds import check_exit_above_entrance
+from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, checkpoint
@@ -49,6 +50,22 @@ def is_project(path: Path) -> bool:
 def beside(path: Path) -> Path:
     """Path of the wave image for that of a ray image or its array: render.png -> wave.png, NAME.png -> NAME-wave.png."""
     return path.with_stem(Path(WAVE).stem if path.stem == Path(RENDER).stem else f"{path.stem}-wave")
+
+
+class LensData(NamedTuple):
+    """A lens of a project or an archive in its scene.
+
+    field, heights: spline spaces of its exit, and control heights (n, m), mm; target: (n_x, n_y) or (3, n_x, n_y) on the screen,
+    None for an archive; figures: of the evaluation of its design; state, provenance: of that, None for an archive.
+    """
+
+    scene: Scene
+    field: HeightField
+    heights: Tensor
+    target: np.ndarray | None = None
+    figures: Mapping[str, Any] = {}
+    state: State | None = None
+    provenance: dict[str, Any] | None = None
 
 
 class Designed(NamedTuple):
@@ -213,6 +230,40 @@ class Project:
         except InputError as error:
             raise self.error(f"{error}") from error
         return Designed(scene, field, heights, state)
+
+    @property
+    def seed(self) -> int:
+        """Seed of all random numbers."""
+        return self.settings.design.seed
+
+    @property
+    def encoding(self) -> str:
+        """Encoding of its picture, and of its images."""
+        return self.settings.target.encoding
+
+    @property
+    def image(self) -> Path:
+        """Name of the image of its lens."""
+        return self.path / RENDER
+
+    def read(self, given: Mapping[str, Any]) -> LensData:
+        """The lens of the last checkpoint, at the parameter values; given: path in `config.table` -> value, overriding settings."""
+        scene = self.scene(given)
+        target = self.target(scene)
+        scene, field, heights, found = self.lens(scene)
+        return LensData(scene, field, heights, target, dict(found.results), found.state, found.provenance)
+
+    def refined_by_waves(self, state: State | None) -> bool:
+        """Whether a design in this state was refined on its wave image."""
+        return state is not None and any(stage.waves for stage in self.settings.design.stages[: state.stage + 1])
+
+    def resolution(self, scene: Scene, field: HeightField, heights: Tensor) -> Resolution:
+        """Resolution of the picture by diffraction."""
+        return Resolution.before(scene, self.settings.target.size)
+
+    def moved(self, path: Path) -> Project:
+        """The project in another directory."""
+        return replace(self, path=path)
 
     def _trained(self, state: State) -> Tensor:
         """Heights (n, m), mm, from the network at the parameter values."""
