@@ -6,6 +6,7 @@ Each function completes its own part of the settings, if present, for `completio
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from caustic_cli.config.default_stages import (
     TWO_SIDED_SPANS,
@@ -37,6 +38,25 @@ BEAM = 1.2  # width of a further lens or mirror over that of a beam from the len
 #: For a free gradient: half range about the index; degree of its splines, knot spans per pixel and their largest number; and
 #: largest number of rays per pixel, since they cost more.
 HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS, RAYS_BENT = 0.05, 3, 2, 768, 16
+
+
+#: Settings that exclude a second target, other elements, and free-form surfaces of those: with any value but the default, or with
+#: one.
+EXCLUDED_BY = {
+    "second": ("lens.mirror", "target.color", "lens.gradient", "lens.array", "design.robust", "design.network", "design.optimizer"),
+    "element": ("design.robust", "design.waves on", "lens.gradient"),
+    "element.free": ("design.network", "design.optimizer", "target.color"),
+}
+
+
+def excluded_by(feature: str, s: Settings) -> dict[str, Any]:
+    """Paths and values of the settings that cannot be combined with a feature of EXCLUDED_BY."""
+    found = {}
+    for path, _, only in (entry.partition(" ") for entry in EXCLUDED_BY[feature]):
+        value = s.value(path)
+        if value == only if only else value != default(path):
+            found[path] = value
+    return found
 
 
 def middle_distance(over: Ranges, z: float, side: float, given: bool) -> float:
@@ -108,20 +128,10 @@ def complete_second(s: Settings) -> SecondSettings | None:
         second = second.changed(focus=check("second.focus", places[0] if len(places) == 1 else places))
     if "file" in second and "z" not in second:
         raise InputError("⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen")
-    wrong = {
-        "lens.mirror": s.lens.mirror,
-        "target.color": s.target.color,
-        "lens.gradient": "gradient" in s.lens,
-        "lens.array": max(s.lens.array) > 1,
-        "design.robust": s.design.robust,
-        "design.network": s.design.network != "none",
-        "design.optimizer": s.design.optimizer != "lbfgs",
-    }
-    for path, given in wrong.items():
-        if given:
-            raise InputError(
-                f"⟨{path}⟩ cannot be combined with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs"
-            )
+    for path in excluded_by("second", s):
+        raise InputError(
+            f"⟨{path}⟩ cannot be combined with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs"
+        )
     if s.source.also or s.source.type == "rays":
         raise InputError(f"⟨second.{said[0]}⟩ needs one source that is no ray file")
     return second
@@ -164,26 +174,10 @@ def complete_two_sided(s: Given, source: Source, quality: str, rays: int | None)
 
 def complete_elements(s: Settings) -> tuple[ElementSettings, ...]:
     """Other lenses and mirrors with their default sizes, and checks of unsupported combinations."""
-    if not s.elements:
-        return ()
-    design = s.design
-    check_compatible_with_elements(
-        {
-            **{f"second.{key}": True for key in _of_second(s)},
-            "design.robust": design.robust,
-            "design.waves": design.waves == "on" and "on",
-            "lens.gradient": s.lens.gradient,
-        }
-    )
+    if s.elements:
+        check_compatible_with_elements({f"second.{key}": True for key in _of_second(s)} | excluded_by("element", s))
     if any(element.free != "none" for element in s.elements):
-        check_compatible_with_elements(
-            {
-                "design.network": design.network != "none" and design.network,
-                "design.optimizer": design.optimizer != "lbfgs" and design.optimizer,
-                "target.color": s.target.color,
-            },
-            free=True,
-        )
+        check_compatible_with_elements(excluded_by("element.free", s), free=True)
     return tuple(_complete_element(element, s) for element in s.elements)
 
 

@@ -69,8 +69,6 @@ def _schema() -> dict[str, dict[str, Setting]]:
 
 
 SCHEMA = _schema()
-#: Optional sections.
-OPTIONAL = ("second", "element")
 STAGE, ELEMENT = in_section("design.stages"), in_section("element")
 #: Keys that hold tables: their heading in the file, and their keys.  Sources after the first are stored in [source] also; keys in
 #: FIRST belong to the first source only.
@@ -260,6 +258,11 @@ class Settings:
     def changed(self, **sections: Any) -> Self:
         """The settings with other sections."""
         return replace(self, **sections)
+
+    def value(self, path: str) -> Any:
+        """The value of a setting, or its default, by its path in `config.table`; None in a section that is not there."""
+        section, _, key = path.partition(".")
+        return getattr(getattr(self, section), key, None)
 
 
 def dump(settings: Settings) -> str:

@@ -26,50 +26,52 @@ WAVELENGTHS = (100.0, 20_000.0)
 
 @dataclass(frozen=True)
 class Option:
-    """The command-line option of a setting: its name, the placeholder of its value, and the commands that have it.
-
-    constant: the value that a flag stands for; common: whether it is an option of every command, which is not generated from this
-    table.
-    """
+    """The command-line option of a setting."""
 
     name: str
+    #: The placeholder of its value.
     metavar: str | None = None
+    #: The commands that have it.
     commands: tuple[str, ...] = ("design",)
+    #: The value that a flag stands for.
     constant: Any = None
+    #: Whether it is an option of every command, which is not generated from this table.
     common: bool = False
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A row of the table.
+    """A row of the table.  As an attribute of a section it is read as the value there, or the default; None without either."""
 
-    path: see the module; kind: number, whole, text, flag, numbers (a pair), wholes (a pair), list (of numbers), points ([x, y, z]
-    or a list of such), tables (a list of tables as text); help: description, for comments, options and the reference; unit; low,
-    high,
-    above: range of each number, `above` if low itself is excluded; choices: of a text; default: None if there is none or if it is
-    derived; derived: how it is derived; why: the reason for the default; written: whether a new project's file contains the
-    default;
-    option: of the command line; speaks_for: other paths that the same option sets; file: the name in a project, without suffix, of
-    the file that it names; before: path of the row before which a parameter is listed.
-
-    As an attribute of a section it is read as the value there, or the default; None without either.
-    """
-
+    #: Section and key, see the module.
     path: str
+    #: number, whole, text, flag, numbers (a pair), wholes (a pair), list (of numbers), points ([x, y, z] or a list of such), tables
+    #: (a list of tables as text).
     kind: str
+    #: Description, for comments, options and the reference.
     help: str
     unit: str = ""
+    #: Range of each number, without `low` itself if `above`.
     low: float = -math.inf
     high: float = math.inf
     above: bool = False
+    #: Of a text.
     choices: tuple[str, ...] = ()
+    #: None if there is none or if it is derived.
     default: Any = None
+    #: How the default is derived.
     derived: str = ""
+    #: The reason for the default.
     why: str = ""
+    #: Whether a new project's file contains the default.
     written: bool = True
+    #: Of the command line.
     option: Option | None = None
+    #: Other paths that the same option sets.
     speaks_for: tuple[str, ...] = ()
+    #: Name in a project, without suffix, of the file that it names.
     file: str = ""
+    #: Path of the row before which a parameter is listed.
     before: str = ""
 
     def __set_name__(self, owner: type[Section], name: str) -> None:
@@ -188,7 +190,7 @@ Numbers = tuple[float, ...]
 Point = tuple[float, float, float]
 Points = tuple[Point, ...]
 Tables = tuple[dict[str, Any], ...]
-#: Kinds of settings by their annotations.
+#: Kinds of settings by their annotations, None aside.
 KINDS = {"float": "number", "int": "whole", "str": "text", "bool": "flag", "Pair": "numbers", "Wholes": "wholes", "Numbers": "list"}
 KINDS |= {"Point": "points", "Points": "points", "Tables": "tables"}
 BOTH = ("design", "render")
@@ -205,35 +207,32 @@ class SourceSettings(Section):
         """The sources after the first."""
         return self.get("also", ())
 
-    type: str = setting("plane: collimated light along +z over the aperture; point; grid of points; disc, an extended"
-            " source; rays, a ray file", default="plane", why="the thesis' first source, section 4.2.1",
-            option=Option("--source", commands=BOTH))
-    power: float = setting("total power of the source, through the aperture or into the cone; in lm, images are in lux",
-            "W",
-            0.0, checks.POWER, above=True, default=1.0, why="images are fractions of the source's power",
+    type: str = setting("plane: collimated light along +z over the aperture; point; grid of points; disc, an extended source; rays,"
+            " a ray file", default="plane", why="the thesis' first source, section 4.2.1", option=Option("--source", commands=BOTH))
+    power: float = setting("total power of the source, through the aperture or into the cone; in lm, images are in lux", "W", 0.0,
+            checks.POWER, above=True, default=1.0, why="images are fractions of the source's power",
             option=Option("--power", "NUMBER[W|lm]", BOTH), speaks_for=("source.power_unit",))
     power_unit: str = setting("W, or lm for images in lux", choices=("W", "lm"), default="W", written=False)
     profile: str | None = setting("plane: file in this directory with the relative irradiance over the aperture", file="profile")
-    file: str | None = setting("ray file (IES TM-25 .tm25ray, Zemax .dat or .sdf, LightTools .ray or .txt), of which the"
-            " project keeps a copy; for a disc, a picture of its brightness with linear values",
+    file: str | None = setting("ray file (IES TM-25 .tm25ray, Zemax .dat or .sdf, LightTools .ray or .txt), of which the project"
+            " keeps a copy; for a disc, a picture of its brightness with linear values",
             option=Option("--source-file", "FILE", BOTH), file="source")
     position: Points | None = setting("point: one or several [x, y, z]; grid, disc: the centre; rays: the file's origin", "mm",
-            *DISTANCE, derived="on the axis, five lens widths in front of the lens", option=Option("--source-position", "X,Y,Z",
-            BOTH))
+            *DISTANCE, derived="on the axis, five lens widths in front of the lens",
+            option=Option("--source-position", "X,Y,Z", BOTH))
     powers: Numbers | None = setting("point: relative power of each position", low=0.0, high=checks.POWER, derived="equal")
     size: Pair | None = setting("full width and height of a grid or disc", "mm", 0.0, 1e9, derived="a fifth of the lens",
             option=Option("--source-size", "W[xH]", BOTH))
-    grid: Wholes | None = setting("points of a grid along x and y", low=1, high=1000, derived="25 x 25",
-            why="figure 6.4.1 of the thesis", option=Option("--source-grid", "N[xM]", BOTH))
-    cone: float | None = setting("half-angle of the cone about +z", "degrees", 1e-9, 90.0,
-            derived="the narrowest that covers the lens", option=Option("--cone", "DEG", BOTH))
+    grid: Wholes | None = setting("points of a grid along x and y", low=1, high=1000, derived="25 x 25", why="figure 6.4.1 of the"
+            " thesis", option=Option("--source-grid", "N[xM]", BOTH))
+    cone: float | None = setting("half-angle of the cone about +z", "degrees", 1e-9, 90.0, derived="the narrowest that covers the"
+            " lens", option=Option("--cone", "DEG", BOTH))
     angle: float | None = setting("disc at infinity (the sun: 0.533): angular diameter", "degrees", 0.0, 170.0,
             derived="a disc at a finite distance", option=Option("--source-angle", "DEG", BOTH))
     intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of"
             " degrees from +z and relative intensity", default="uniform", why="an isotropic source, the simplest",
             option=Option("--intensity", "uniform|lambertian|FILE", BOTH), file="intensity")
-    aim: bool = setting("sample rays over the lens instead of the whole cone", default=True,
-            why="no rays that miss the lens")
+    aim: bool = setting("sample rays over the lens instead of the whole cone", default=True, why="no rays that miss the lens")
     polarisation: float | None = setting("direction of linear polarisation from +x", "degrees", -360.0, 360.0,
             derived="unpolarised", option=Option("--polarisation", "DEG", BOTH))
     wavelengths: Numbers | None = setting("wavelengths of the source's spectrum; a glass has its own index at each", "nm",
@@ -246,14 +245,13 @@ class LensSettings(Section):
     """[lens]: the lens."""
 
     section = "lens"
-    size: Pair = setting("full width and height of the lens' aperture", "mm", *LENS, default=[10.0, 10.0],
-            why="table D.2 of the thesis, in millimetres", option=Option("--lens-size", "W[xH]"))
-    z_in: float = setting("position of the plane entrance, or reference plane of a free-form one", "mm",
-            -checks.LENGTH, checks.LENGTH, default=0.0,
-            why="the origin of the lens")
-    thickness: float = setting("centre height of the base surface above the lens' origin", "mm", -checks.LENGTH,
-            checks.LENGTH, derived="half the width of a lens up to 20 mm; for a wider one, a least wall of 3 mm; with two"
-            " free-form sides twice the width", why="table D.2 of the thesis; a plate is thin; two sides need a distance",
+    size: Pair = setting("full width and height of the lens' aperture", "mm", *LENS, default=[10.0, 10.0], why="table D.2 of the"
+            " thesis, in millimetres", option=Option("--lens-size", "W[xH]"))
+    z_in: float = setting("position of the plane entrance, or reference plane of a free-form one", "mm", -checks.LENGTH,
+            checks.LENGTH, default=0.0, why="the origin of the lens")
+    thickness: float = setting("centre height of the base surface above the lens' origin", "mm", -checks.LENGTH, checks.LENGTH,
+            derived="half the width of a lens up to 20 mm; for a wider one, a least wall of 3 mm; with two free-form sides twice"
+            " the width", why="table D.2 of the thesis; a plate is thin; two sides need a distance",
             option=Option("--thickness", "MM"))
     radius: Pair = setting("radii of the base surface along x and y; inf is flat, positive is diverging", "mm",
             derived="the sphere that spreads the light over the picture", why="table 6.1 of the thesis")
@@ -263,35 +261,33 @@ class LensSettings(Section):
             why="a wall that can be machined and mounted", option=Option("--min-thickness", "MM"))
     index: float = setting("refractive index", low=1.0, high=5.0, above=True, default=1.5443, written=False,
             why="table D.2 of the thesis", option=Option("--index"))
-    glass: str | None = setting("material instead of an index, by its common name: acrylic, polycarbonate, BK7, resin,"
-            " water, ... (list: all of them); N-BK7 for a coloured picture", option=Option("--glass", "NAME"))
+    glass: str | None = setting("material instead of an index, by its common name: acrylic, polycarbonate, BK7, resin, water, ..."
+            " (list: all of them); N-BK7 for a coloured picture", option=Option("--glass", "NAME"))
     wavelength: float = setting("wavelength of the glass' index", "nm", *WAVELENGTHS, default=587.5618, written=False,
             why="the d line, for which catalogues give indices")
-    fresnel: str = setting("reflection losses: none, schlick or exact", choices=("none", "schlick", "exact"),
-            default="exact", why="every uncoated surface reflects")
-    absorption: float = setting("absorption coefficient a: transmittance exp(-a t) of t mm of glass (Beer-Lambert)",
-            "1/mm", 0.0, 1e6, default=0.0,
-            written=False, option=Option("--absorption", "PER_MM", BOTH))
-    roughness: float = setting("standard deviation of the exit's microfacet slopes along an axis, mm per mm",
-            low=0.0, high=1.0, default=0.0, written=False, option=Option("--roughness", "SLOPE", BOTH))
-    mirror: bool = setting("the surface is a mirror, with the screen on the source's side, beside its light",
-            default=False, written=False, option=Option("--mirror"))
-    aperture: str = setting("shape of the lens: rectangle, or circle, the largest within size",
-            choices=("rectangle", "circle"), default="rectangle", written=False,
-            option=Option("--aperture", "rectangle|circle"))
-    border: float = setting("width of a mounting rim around the aperture in exported solids", "mm", 0.0,
-            1e6, default=0.0, written=False, option=Option("--border", "MM"))
-    array: Wholes = setting("lenslets along x and y, each of which projects the whole picture", low=1, high=100,
-            default=[1, 1], written=False, option=Option("--array", "N[xM]"))
+    fresnel: str = setting("reflection losses: none, schlick or exact", choices=("none", "schlick", "exact"), default="exact",
+            why="every uncoated surface reflects")
+    absorption: float = setting("absorption coefficient a: transmittance exp(-a t) of t mm of glass (Beer-Lambert)", "1/mm", 0.0,
+            1e6, default=0.0, written=False, option=Option("--absorption", "PER_MM", BOTH))
+    roughness: float = setting("standard deviation of the exit's microfacet slopes along an axis, mm per mm", low=0.0, high=1.0,
+            default=0.0, written=False, option=Option("--roughness", "SLOPE", BOTH))
+    mirror: bool = setting("the surface is a mirror, with the screen on the source's side, beside its light", default=False,
+            written=False, option=Option("--mirror"))
+    aperture: str = setting("shape of the lens: rectangle, or circle, the largest within size", choices=("rectangle", "circle"),
+            default="rectangle", written=False, option=Option("--aperture", "rectangle|circle"))
+    border: float = setting("width of a mounting rim around the aperture in exported solids", "mm", 0.0, 1e6, default=0.0,
+            written=False, option=Option("--border", "MM"))
+    array: Wholes = setting("lenslets along x and y, each of which projects the whole picture", low=1, high=100, default=[1, 1],
+            written=False, option=Option("--array", "N[xM]"))
     gradient: str | None = setting("gradient index of the lens: selfoc, radial or axial, with gradient_terms; volume, with an"
             " index_file; free, designed instead of the surface, between flat sides",
             choices=("selfoc", "radial", "axial", "volume", "free"), derived="homogeneous",
             option=Option("--gradient", "selfoc|radial|axial|volume|free"))
-    gradient_terms: Numbers | None = setting("selfoc: g of n^2 = index^2 (1 - (g r)^2), 1/mm; radial: a, b, ... of index + a r^2"
-            " + b r^4 + ...; axial: of index + a z + b z^2 + ..., z from the entrance; r and z in mm",
+    gradient_terms: Numbers | None = setting("selfoc: g of n^2 = index^2 (1 - (g r)^2), 1/mm; radial: a, b, ... of index + a r^2 +"
+            " b r^4 + ...; axial: of index + a z + b z^2 + ..., z from the entrance; r and z in mm",
             option=Option("--gradient-terms", "A[,B...]"))
-    index_file: str | None = setting("control values (n, m) or (n, m, k) of a B-spline volume of refractive index over aperture"
-            " and thickness, .npy, of which the project keeps a copy; for a free gradient, the result",
+    index_file: str | None = setting("control values (n, m) or (n, m, k) of a B-spline volume of refractive index over aperture and"
+            " thickness, .npy, of which the project keeps a copy; for a free gradient, the result",
             option=Option("--index-file", "FILE"), file="index")
     index_range: Pair = setting("least and largest control value of a free gradient", low=1.0, high=5.0,
             derived="the index, 0.05 less to 0.05 more", why="the range of gradients in glass and printed polymers",
@@ -300,11 +296,10 @@ class LensSettings(Section):
             derived="two knot spans per pixel", why="as for a surface", option=Option("--index-control", "N[xM]"))
     index_layers: int = setting("control values of a free gradient along z", low=1, high=64, default=1, written=False,
             why="in a thin blank only the integral of the index along a ray matters")
-    control: Wholes = setting("control points of the finished lens", low=2, high=4096,
-            derived="by picture and quality: two knot spans per pixel", why="finer than the picture, so that it is no limit",
-            option=Option("--control", "N[xM]"))
-    degree: Wholes = setting("spline degrees, 1 to 15", low=1, high=15, default=[3, 3],
-            why="the least with continuous curvature", option=Option("--degree", "P[xQ]"))
+    control: Wholes = setting("control points of the finished lens", low=2, high=4096, derived="by picture and quality: two knot"
+            " spans per pixel", why="finer than the picture, so that it is no limit", option=Option("--control", "N[xM]"))
+    degree: Wholes = setting("spline degrees, 1 to 15", low=1, high=15, default=[3, 3], why="the least with continuous curvature",
+            option=Option("--degree", "P[xQ]"))
     knots_u: Numbers | None = setting("knot vector on [0, 1] along x", derived="open, equispaced")
     knots_v: Numbers | None = setting("knot vector on [0, 1] along y", derived="open, equispaced")
 
@@ -313,17 +308,16 @@ class ScreenSettings(Section):
     """[screen]: the screen."""
 
     section = "screen"
-    z: float = setting("distance from the lens' origin", "mm", *DISTANCE, default=300.0,
-            why="table D.2 of the thesis, in millimetres")
+    z: float = setting("distance from the lens' origin", "mm", *DISTANCE, default=300.0, why="table D.2 of the thesis, in"
+            " millimetres")
     size: Pair = setting("full width and height", "mm", *SCREEN, derived="picture plus margin")
     resolution: Wholes = setting("pixels along x and y", low=2, high=16384, derived="250 across")
-    tilt: Pair = setting("rotation of the screen about its own centre: about the fixed x axis, then about the"
-            " fixed y axis", "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False,
-            option=Option("--screen-tilt", "A,B", BOTH))
-    shift: Pair = setting("decentre of the screen; by default that of a mirror is shifted out of the light of its"
-            " source", "mm", -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH))
-    radius: Pair | None = setting("radii of curvature of a curved screen along x and y: the same for a sphere, inf along"
-            " one axis for a cylinder; positive bends the edges towards +z, away from a lens", "mm", derived="plane", written=False,
+    tilt: Pair = setting("rotation of the screen about its own centre: about the fixed x axis, then about the fixed y axis",
+            "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False, option=Option("--screen-tilt", "A,B", BOTH))
+    shift: Pair = setting("decentre of the screen; by default that of a mirror is shifted out of the light of its source", "mm",
+            -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH))
+    radius: Pair | None = setting("radii of curvature of a curved screen along x and y: the same for a sphere, inf along one axis"
+            " for a cylinder; positive bends the edges towards +z, away from a lens", "mm", derived="plane", written=False,
             option=Option("--screen-radius", "R[,RY]", BOTH))
     shape_file: str | None = setting("file of a screen's shape, of which the project keeps a copy: heights in mm along +z on a"
             " uniform grid over the screen, borders included; a 2-D .npy [i, j] or a .tif of 32-bit floats",
@@ -335,16 +329,15 @@ class TargetSettings(Section):
 
     section = "target"
     file: str = setting("the picture, in this directory")
-    size: Pair = setting("width and height of the picture on the screen", "mm", *SCREEN,
-            derived="mag times the lens' width")
+    size: Pair = setting("width and height of the picture on the screen", "mm", *SCREEN, derived="mag times the lens' width")
     encoding: str = setting("encoding of the picture's values: srgb, or linear (irradiance)", choices=("srgb", "linear"),
             default="srgb", why="the encoding of image files", option=Option("--linear", constant="linear"))
     flip: str = setting("mirror the picture along x, y or xy, for a viewer on the lens' side; empty for none",
             choices=("", "x", "y", "xy"), default="", option=Option("--flip", "x|y|xy"))
-    sheet: bool = setting("the picture is a contact sheet with a separate picture for each lenslet of an"
-            " array", default=False, written=False, option=Option("--sheet"))
-    color: bool = setting("three colour channels (611, 549, 464 nm), with the glass' index for each", default=False,
-            written=False, option=Option("--color"))
+    sheet: bool = setting("the picture is a contact sheet with a separate picture for each lenslet of an array", default=False,
+            written=False, option=Option("--sheet"))
+    color: bool = setting("three colour channels (611, 549, 464 nm), with the glass' index for each", default=False, written=False,
+            option=Option("--color"))
 
 
 class SecondSettings(Section):
@@ -353,42 +346,36 @@ class SecondSettings(Section):
     section = "second"
     file: str | None = setting("second picture, formed by the same light on a screen farther away; in this directory",
             option=Option("--second", "PICTURE"), file="second")
-    z: float = setting("distance of that screen from the lens' origin", "mm", *DISTANCE,
-            option=Option("--second-at", "MM"))
-    size: Pair = setting("width and height of that picture", "mm", *SCREEN,
-            derived="that of a beam from the lens' edge through that of the first picture", option=Option("--second-size",
-            "W[xH]"))
-    collimate: bool = setting("collimate the light behind the picture, parallel to the axis", default=False,
-            written=False,
+    z: float = setting("distance of that screen from the lens' origin", "mm", *DISTANCE, option=Option("--second-at", "MM"))
+    size: Pair = setting("width and height of that picture", "mm", *SCREEN, derived="that of a beam from the lens' edge through"
+            " that of the first picture", option=Option("--second-size", "W[xH]"))
+    collimate: bool = setting("collimate the light behind the picture, parallel to the axis", default=False, written=False,
             option=Option("--collimate"))
-    focus: Point | None = setting("focus of the light behind the picture", "mm", *DISTANCE,
-            option=Option("--focus", "X,Y,Z"))
+    focus: Point | None = setting("focus of the light behind the picture", "mm", *DISTANCE, option=Option("--focus", "X,Y,Z"))
 
 
 class ElementSettings(Section):
     """[[element]]: another lens or a fold mirror."""
 
     section = "element"
-    type: str = setting("singlet lens, or mirror, which folds the axis", choices=("lens", "mirror"),
-            derived="lens")
+    type: str = setting("singlet lens, or mirror, which folds the axis", choices=("lens", "mirror"), derived="lens")
     z: float = setting("position of its first vertex; behind a mirror measured along the folded axis", "mm", *DISTANCE)
-    thickness: float = setting("centre thickness of a lens", "mm", 0.0, checks.LENGTH, above=True, default=4.0,
-            written=False, why="a common small lens")
-    radius: Pair | None = setting("radii of curvature of front and back, for a mirror the first only; positive if the"
-            " centre lies behind the surface, inf for flat", "mm", derived="flat")
+    thickness: float = setting("centre thickness of a lens", "mm", 0.0, checks.LENGTH, above=True, default=4.0, written=False,
+            why="a common small lens")
+    radius: Pair | None = setting("radii of curvature of front and back, for a mirror the first only; positive if the centre lies"
+            " behind the surface, inf for flat", "mm", derived="flat")
     index: float = setting("refractive index of a lens", low=1.0, high=5.0, above=True, default=1.5168, written=False,
             why="N-BK7 at the d line")
     glass: str | None = setting("material instead of an index, as lens.glass")
-    absorption: float = setting("absorption coefficient a: transmittance exp(-a t) of t mm of its glass", "1/mm", 0.0,
-            1e6, default=0.0,
-            written=False)
-    size: Pair = setting("full width and height of its aperture", "mm", *LENS,
-            derived="that of the lens in front of it; behind it a fifth more than a straight beam to the picture needs")
-    aperture: str = setting("shape of its aperture: rectangle, or circle, the largest within size",
-            choices=("rectangle", "circle"), default="rectangle", written=False)
+    absorption: float = setting("absorption coefficient a: transmittance exp(-a t) of t mm of its glass", "1/mm", 0.0, 1e6,
+            default=0.0, written=False)
+    size: Pair = setting("full width and height of its aperture", "mm", *LENS, derived="that of the lens in front of it; behind it"
+            " a fifth more than a straight beam to the picture needs")
+    aperture: str = setting("shape of its aperture: rectangle, or circle, the largest within size", choices=("rectangle", "circle"),
+            default="rectangle", written=False)
     tilt: Pair | None = setting("rotation of a mirror about x or about y", "degrees", -85.0, 85.0)
-    free: str = setting("free-form surfaces to be designed: none, front, back or both",
-            choices=("none", "front", "back", "both"), default="none", written=False, why="stock lenses are spherical")
+    free: str = setting("free-form surfaces to be designed: none, front, back or both", choices=("none", "front", "back", "both"),
+            default="none", written=False, why="stock lenses are spherical")
 
 
 class StageSettings(Section):
@@ -397,8 +384,8 @@ class StageSettings(Section):
     section = "design.stages"
     source: str | None = setting("source type in this stage, with the other keys of [source]")
     control: Wholes = setting("control points", low=2, high=4096, derived="the lens'")
-    rays: int = setting("rays per iteration", low=1, high=10**12, derived="9 per pixel",
-            why="750 x 750 on 250 x 250 pixels, tables D.1 and D.2 of the thesis")
+    rays: int = setting("rays per iteration", low=1, high=10**12, derived="9 per pixel", why="750 x 750 on 250 x 250 pixels, tables"
+            " D.1 and D.2 of the thesis")
     sampler: str = setting("grid, lines, stratified, uniform or sobol", derived="by the source")
     reconstruction: str = setting("bincount, gaussian or cosine", derived="cosine")
     filter_size: Wholes = setting("filter size in pixels, odd", derived="3 x 3")
@@ -411,10 +398,8 @@ class StageSettings(Section):
     oversample: int = setting("subdivide pixels for the filter by this factor, and sum them: sharper than the filter on pixels",
             low=1, high=8, default=1)
     blur: float = setting("blur of render and target in the loss", "pixels", 0.0, 1000.0, default=0.0)
-    apron: int = setting("guard band: dark pixels around the screen that detect stray light", low=0, high=4096,
-            default=0)
-    iterations: int = setting("largest number of iterations", low=0, high=10**9, default=1000,
-            why="section 6.2.1 of the thesis")
+    apron: int = setting("guard band: dark pixels around the screen that detect stray light", low=0, high=4096, default=0)
+    iterations: int = setting("largest number of iterations", low=0, high=10**9, default=1000, why="section 6.2.1 of the thesis")
     tolerance: float = setting("end the stage when 10 iterations reduce the loss by less than this fraction; 0: never", low=0.0,
             high=1.0, default=0.0)
     waves: Numbers | None = setting("refine the wave image at these wavelengths, if the source has none, instead of the ray image",
@@ -431,60 +416,54 @@ class DesignSettings(Section):
         """The [[design.stages]]."""
         return self.get("stages", ())
 
-    loss: str = setting("weighted sum of rms (eq. 5.2.1), rms-light (including light off the screen), throughput, light"
-            " (light off the screen), diffusion, uniformity, laplacian, curvature: 'rms-light + 0.01 laplacian'",
-            default="rms-light", why="eq. 5.2.1 alone is reduced by sending light off the screen", option=Option("--loss"))
+    loss: str = setting("weighted sum of rms (eq. 5.2.1), rms-light (including light off the screen), throughput, light (light off"
+            " the screen), diffusion, uniformity, laplacian, curvature: 'rms-light + 0.01 laplacian'", default="rms-light",
+            why="eq. 5.2.1 alone is reduced by sending light off the screen", option=Option("--loss"))
     max_slope: float = setting("largest slope of the surface, mm per mm; 0 for no limit", low=0.0, default=0.0,
             option=Option("--max-slope"))
-    min_radius: float = setting("least radius of curvature of concave regions, such as a tool's; 0 for no limit", "mm",
-            0.0,
+    min_radius: float = setting("least radius of curvature of concave regions, such as a tool's; 0 for no limit", "mm", 0.0,
             default=0.0, option=Option("--min-radius", "MM"))
-    optimizer: str = setting("lbfgs or adam", choices=("lbfgs", "adam"), default="lbfgs",
-            why="fewest evaluations for a given error: caustic convergence, study design; adam for a network",
-            option=Option("--optimizer"))
+    optimizer: str = setting("lbfgs or adam", choices=("lbfgs", "adam"), default="lbfgs", why="fewest evaluations for a given"
+            " error: caustic convergence, study design; adam for a network", option=Option("--optimizer"))
     lr: float = setting("learning rate of adam", low=0.0, above=True, default=1e-3, why="table D.2 of the thesis",
             option=Option("--lr"))
     network: str = setting("parametrisation of the heights: none, sparse or dense", choices=("none", "sparse", "dense"),
             default="none", why="control heights converge fastest", option=Option("--network"))
     network_layers: int = setting("hidden layers of a dense network", low=1, high=16, default=2, written=False,
             why="three with the final tanh, as in the thesis", option=Option("--network-layers", "N"))
-    network_width: int = setting("neurons per hidden layer of a dense network; 0 for the number of control points",
-            low=0, high=1_000_000, default=0, written=False, why="as in the thesis", option=Option("--network-width", "N"))
-    activation: str = setting("activation function of a dense network: tanh, relu, silu or sine", choices=("tanh",
-            "relu", "silu", "sine"),
-            default="tanh", written=False, why="as in the thesis", option=Option("--activation", "tanh|relu|silu|sine"))
-    over: str = setting("ranges of network inputs, so that one trained network gives a lens for every value: throw,"
-            " source.x, source.y, source.z = LOW:HIGH, separated by commas", "mm", default="", written=False,
+    network_width: int = setting("neurons per hidden layer of a dense network; 0 for the number of control points", low=0,
+            high=1_000_000, default=0, written=False, why="as in the thesis", option=Option("--network-width", "N"))
+    activation: str = setting("activation function of a dense network: tanh, relu, silu or sine",
+            choices=("tanh", "relu", "silu", "sine"), default="tanh", written=False, why="as in the thesis",
+            option=Option("--activation", "tanh|relu|silu|sine"))
+    over: str = setting("ranges of network inputs, so that one trained network gives a lens for every value: throw, source.x,"
+            " source.y, source.z = LOW:HIGH, separated by commas", "mm", default="", written=False,
             option=Option("--over", "KEY=LOW:HIGH[,...]"))
-    initial: str = setting("initial parameters: zero, uniform (+-1e-4), random, or zero-last (random except for the last"
-            " layer of a network, which is zero, so that it starts at the initial surface)",
-            choices=("zero", "uniform", "random", "zero-last"), default="zero",
-            derived="zero; zero-last of a preconditioned network")
-    preconditioner: str = setting("none or laplacian", choices=("none", "laplacian"),
-            derived="laplacian for heights with lbfgs, and for a network trained over a range",
-            option=Option("--preconditioner", "none|laplacian"))
-    filter_target: bool = setting("filter the target like the render", default=True,
-            why="otherwise the blur of the filter counts as an error")
-    waves: str = setting("refine the wave image after the ray image: auto (where diffraction matters and time allows),"
-            " on or off", choices=("auto", "on", "off"), default="auto", why="effects are simulated where a scene needs them",
+    initial: str = setting("initial parameters: zero, uniform (+-1e-4), random, or zero-last (random except for the last layer of a"
+            " network, which is zero, so that it starts at the initial surface)",
+            choices=("zero", "uniform", "random", "zero-last"), default="zero", derived="zero; zero-last of a preconditioned"
+            " network")
+    preconditioner: str = setting("none or laplacian", choices=("none", "laplacian"), derived="laplacian for heights with lbfgs,"
+            " and for a network trained over a range", option=Option("--preconditioner", "none|laplacian"))
+    filter_target: bool = setting("filter the target like the render", default=True, why="otherwise the blur of the filter counts"
+            " as an error")
+    waves: str = setting("refine the wave image after the ray image: auto (where diffraction matters and time allows), on or off",
+            choices=("auto", "on", "off"), default="auto", why="effects are simulated where a scene needs them",
             option=Option("--waves", "auto|on|off"))
-    robust: str = setting("file of manufacturing and alignment errors, such as examples/tolerances.toml, over which the"
-            " loss of the last stage is averaged; empty for none", default="", written=False,
-            option=Option("--robust", "FILE"), file="tolerances")
-    start: str = setting("initial surface: transport (optimal transport of the light to the picture), offset (the base"
-            " sphere given by the magnification), or the lens of another project or of a file: .npz, .step or height map as"
-            " exported, .npy of heights in mm", derived="transport; offset for a network, adam, several points or a coarse net",
+    robust: str = setting("file of manufacturing and alignment errors, such as examples/tolerances.toml, over which the loss of the"
+            " last stage is averaged; empty for none", default="", written=False, option=Option("--robust", "FILE"),
+            file="tolerances")
+    start: str = setting("initial surface: transport (optimal transport of the light to the picture), offset (the base sphere given"
+            " by the magnification), or the lens of another project or of a file: .npz, .step or height map as exported, .npy of"
+            " heights in mm", derived="transport; offset for a network, adam, several points or a coarse net",
             option=Option("--start", "transport|offset|PROJECT|FILE"))
-    iterations: int = setting("total number of iterations, including those before a resume; 0: as given by the stages",
-            low=0, high=10**9,
-            default=0, derived="as given by the stages", option=Option("--iterations"))
-    time_limit: float = setting("time limit of the whole command, at least a quarter of it for the iterations; inf for none",
-            "s", 0.0, above=True, default=math.inf,
-            option=Option("--time-limit", "SECONDS"))
-    checkpoint_every: float = setting("time between checkpoints", "s", 0.0, above=True, default=10.0,
-            why="work lost if the process is killed; checkpoints of large nets take seconds and are written less often")
-    seed: int = setting("seed of all random numbers: the same seed gives the same bytes", low=0, high=2**31 - 1,
-            default=0,
+    iterations: int = setting("total number of iterations, including those before a resume; 0: as given by the stages", low=0,
+            high=10**9, default=0, derived="as given by the stages", option=Option("--iterations"))
+    time_limit: float = setting("time limit of the whole command, at least a quarter of it for the iterations; inf for none", "s",
+            0.0, above=True, default=math.inf, option=Option("--time-limit", "SECONDS"))
+    checkpoint_every: float = setting("time between checkpoints", "s", 0.0, above=True, default=10.0, why="work lost if the process"
+            " is killed; checkpoints of large nets take seconds and are written less often")
+    seed: int = setting("seed of all random numbers: the same seed gives the same bytes", low=0, high=2**31 - 1, default=0,
             option=Option("--seed", common=True))
     dtype: str = setting("precision of the rays: float32 or float64", choices=("float32", "float64"), default="float32",
             why="the sampling noise exceeds its rounding errors", option=Option("--dtype", common=True))
@@ -509,18 +488,17 @@ class Parameters(Section):
             before="screen.size")
     resolution: Wholes | None = setting("pixels of the whole screen; a single number is across, the rows follow from the aspect"
             " ratio", derived="250", why="table D.2 of the thesis", option=Option("--resolution", "N[xM]"),
-            speaks_for=("screen.resolution",),
-            before="screen.resolution")
-    mag: float = setting("width of the picture in lens widths", low=1e-3, high=1e3, default=3.0,
-            why="table 6.1 of the thesis", option=Option("--mag"), before="target.file")
+            speaks_for=("screen.resolution",), before="screen.resolution")
+    mag: float = setting("width of the picture in lens widths", low=1e-3, high=1e3, default=3.0, why="table 6.1 of the thesis",
+            option=Option("--mag"), before="target.file")
     margin: float = setting("total width of the dark border relative to the picture", low=0.0, high=100.0, default=0.28,
-            why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, which shows stray light",
-            option=Option("--margin"), before="target.file")
-    invert: bool = setting("invert the picture, for drawings in black on white or on a transparent background",
-            default=False, option=Option("--invert"), before="target.color")
-    elements: Tables | None = setting("further lens or fold mirror on the axis, with the keys of an [[element]] table:"
-            " 'lens z=-40 thickness=4 radius=50,inf glass=N-BK7', 'mirror z=150 tilt=45,0'; may be repeated, in the order in which"
-            " light reaches them", derived="none", option=Option("--element", "'TYPE KEY=VALUE...'"), speaks_for=("element",),
+            why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, which shows stray light", option=Option("--margin"),
+            before="target.file")
+    invert: bool = setting("invert the picture, for drawings in black on white or on a transparent background", default=False,
+            option=Option("--invert"), before="target.color")
+    elements: Tables | None = setting("further lens or fold mirror on the axis, with the keys of an [[element]] table: 'lens z=-40"
+            " thickness=4 radius=50,inf glass=N-BK7', 'mirror z=150 tilt=45,0'; may be repeated, in the order in which light"
+            " reaches them", derived="none", option=Option("--element", "'TYPE KEY=VALUE...'"), speaks_for=("element",),
             before="element.type")
     quality: str | None = setting("quality of the default stages: draft, standard or fine", choices=("draft", "standard", "fine"),
             derived="standard, or by the time limit", option=Option("--quality"), before="design.loss")
