@@ -419,7 +419,7 @@ def test_a_design_says_that_it_leaves_waves_out():
     """By default the wave image is refined where diffraction matters; not on a curved screen, and a line says why."""
     for screen, stages in (({}, True), ({"radius": [60.0, 60.0]}, False)):
         full = complete({"screen": screen}, 1.0)
-        assert any(stage.get("waves") for stage in full["design"]["stages"]) == stages
+        assert any(stage.waves for stage in full.design.stages) == stages
         assert without_waves(full, False) == ("" if stages else "a curved screen has no wave image")
     scene = scene_of(screen_of(SPHERE))
     assert not compile_plan(scene, HeightField.of(scene.lens), bumpy(scene))["diffraction"].on

@@ -304,7 +304,7 @@ from caustic_cli.optics.trace import expose
 
 full = complete(settings.parse('[source]\\ntype = "spokes"\\nspokes = 7\\n[lens]\\ncontrol = [8, 8]', "here"), 1.0)
 again = settings.parse(settings.dump(full), "there")
-scene = settings.build_scene(again)
+scene = settings.build_scene(settings.Settings.of(again))
 rays = rays_of(scene, "stratified", 6300)
 exposure = expose(scene, HeightField.of(scene.lens), torch.full((8, 8), 5.0, dtype=torch.float64), rays)
 assert abs(float(exposure.image.sum()) + sum(exposure.lost.values()) - 1.0) < 1e-12

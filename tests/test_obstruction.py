@@ -188,7 +188,7 @@ def test_a_mirror_throws_its_picture_beside_the_light_on_it(capfd):
     out, err = run(capfd, "design", "blob.png", "--preset", "mirror-100", *SMALL, "--json")
     assert "the screen is shifted by 0,250 mm" in err and json.loads(out)["on_screen"] > 0.9
     project = Project.open("blob.caustic")
-    assert project.settings["screen"]["shift"] == [0.0, 250.0] and found(SUN, project.scene().screen) is None
+    assert project.settings.screen.shift == (0.0, 250.0) and found(SUN, project.scene().screen) is None
     run(capfd, "render", "blob.caustic", "--rays", "1e4")
     run(capfd, "export", "blob.caustic", "--format", "lighttools", "-o", "blob.npz")
     for source in ("blob.caustic", "blob.npz"):

@@ -295,14 +295,14 @@ def ring(monkeypatch):
 def test_a_source_from_outside(ring, kernels, tmp_path):
     """Through the registries alone: out of [source], into a plan, onto the screen, and out of every export in one sentence."""
     full = complete({"source": {"type": "ring", "power": 2.0}, "lens": {"control": [8, 7]}}, 1.0)
-    assert full["source"]["position"] == [[0.0, 0.0, -20.0]] and full["design"]["stages"][-1]["sampler"] == "stratified"
-    assert "intensity" not in full["source"] and 'type = "ring"' in settings.dump(full)
-    source = settings.build_source(full)
+    assert full.source.position == ((0.0, 0.0, -20.0),) and full.design.stages[-1].sampler == "stratified"
+    assert "intensity" not in full.source and 'type = "ring"' in settings.dump(full)
+    source = settings.build_source(full.source)
     assert isinstance(source, Ring) and source.power == 2.0 and source.nearest == -20.0
     assert source.centre == pytest.approx((0.0, 0.0, -20.0)) and source.powers == pytest.approx((1 / 6,) * 12)
-    settings.refuse_unused(full["source"], ["source.size"])
+    settings.refuse_unused(full.source, ["source.size"])
     with pytest.raises(InputError, match="cone belongs to source point, grid or disc, got ring"):
-        settings.refuse_unused(full["source"], ["source.cone"])
+        settings.refuse_unused(full.source, ["source.cone"])
 
     lens = Lens(size=(10.0, 8.0), control=(8, 7), index=1.5, offset=Offset(5.0, (-40.0, -40.0)))
     scene, field = Scene(source, lens, Screen((12.0, 12.0), 60.0, (20, 16))), HeightField.of(lens)

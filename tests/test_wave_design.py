@@ -169,9 +169,9 @@ def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
     monkeypatch.setattr(workflow, "_run", begun)
     small = SMALL if "--resolution" not in extra else [a for a in SMALL if a not in ("--resolution", "32")]
     design(capfd, "blob.png", *small, *extra, "-o", "p")
-    tables = workflow.Project.open("p").settings["design"]["stages"]
-    assert any(t.get("waves") for t in tables) == stages
-    assert not stages or [len(t["waves"]) for t in tables if t.get("waves")] == [WAVES["standard"][0]] * len(WAVES["standard"][1])
+    tables = workflow.Project.open("p").settings.design.stages
+    assert any(t.waves for t in tables) == stages
+    assert not stages or [len(t.waves) for t in tables if t.waves] == [WAVES["standard"][0]] * len(WAVES["standard"][1])
 
 
 OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"

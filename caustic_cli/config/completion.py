@@ -7,8 +7,7 @@ completed in `optional`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,18 +33,19 @@ from caustic_cli.config.default_stages import (
     wave_refinement,
 )
 from caustic_cli.config.optional import (
-    centre_screen,
     complete_blank,
     complete_elements,
     complete_index_design,
-    complete_over,
+    complete_network,
     complete_second,
     complete_second_size,
     complete_two_sided,
     default_magnification,
+    middle_distance,
+    middle_source,
 )
 from caustic_cli.config.settings import (
-    DEFAULTS,
+    Given,
     Settings,
     build_lens,
     build_light,
@@ -53,10 +53,21 @@ from caustic_cli.config.settings import (
     build_source,
     elements_of,
     index_of,
+    tables_of,
     value_of,
-    with_defaults,
 )
-from caustic_cli.config.table import check, default
+from caustic_cli.config.table import (
+    DesignSettings,
+    LensSettings,
+    Parameters,
+    ScreenSettings,
+    SourceSettings,
+    StageSettings,
+    TargetSettings,
+    check,
+    check_all,
+    default,
+)
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.lenslets import NEEDS_DISTANT_SOURCE
@@ -85,33 +96,8 @@ OBLONG = 2.5  # anamorphic ratio of the magnifications from which on another len
 COLOR_GLASS = "N-BK7"  # for a coloured picture without glass or index, since dispersion has to be known
 
 
-@dataclass(frozen=True)
-class Derivation:
-    """Parameters from which settings are derived and which are not stored in a project, by their paths in the table; None if not
-    given.
-
-    mag: picture width over lens width; margin: total width of the dark border relative to the picture; throw: distance of the
-    screen;
-    screen_size: mm, (width,) or (width, height); resolution: pixels, (across,) or (across, up); quality: of the default stages;
-    rays: of the last default stage.
-    """
-
-    mag: float | None = None
-    margin: float | None = None
-    throw: float | None = None
-    screen_size: tuple[float, ...] | None = None
-    resolution: tuple[int, ...] | None = None
-    quality: str | None = None
-    rays: int | None = None
-
-    def __post_init__(self):
-        for key in ("mag", "margin", "throw", "quality", "rays"):
-            if getattr(self, key) is not None:
-                check(key, getattr(self, key))
-
-
 def complete(
-    given: Settings, aspect: float, by: Derivation | None = None, lit: tuple[float, float] = (1.0, 1.0), gaps: float = 0.0
+    given: Given, aspect: float, by: Parameters | None = None, lit: tuple[float, float] = (1.0, 1.0), gaps: float = 0.0
 ) -> Settings:
     """The complete settings of a project.
 
@@ -125,85 +111,104 @@ def complete(
     Raises:
         InputError: a value is out of range, or two contradict each other.
     """
-    s, by = with_defaults(given), by or Derivation()
-    lens, screen, target = s["lens"], s["screen"], s["target"]
-    if value_of(target, "target.sheet"):
-        array = check("lens.array", value_of(lens, "lens.array"))
-        if max(array) == 1 or value_of(target, "target.color"):
-            raise InputError("⟨target.sheet⟩ needs ⟨+lens.array⟩, and a picture without colours")
-        aspect, lit = aspect * array[0] / array[1], (1.0, 1.0)
-    mirror = value_of(lens, "lens.mirror")
-    if by.throw is not None:
-        screen["z"] = -by.throw if mirror else by.throw
-    elif mirror and "z" not in given.get("screen", {}):
-        screen["z"] = -screen["z"]
-    if by.screen_size is not None:
-        screen["size"] = [by.screen_size[0], by.screen_size[-1] if len(by.screen_size) == 2 else by.screen_size[0] * aspect]
-    if by.resolution is not None:
-        screen.pop("resolution", None)
-        if len(by.resolution) == 2:
-            screen["resolution"] = list(by.resolution)
-    if value_of(target, "target.color"):
-        if s["source"].get("also"):
-            raise InputError("[[source]] of a coloured picture must be one, whose three wavelengths are its colours")
-        s["source"].setdefault("wavelengths", list(RGB))
-        if "index" not in lens:
-            lens.setdefault("glass", COLOR_GLASS)
-    over = Ranges.parse(value_of(s["design"], "design.over"))
-    if over and "throw" in over.keys:
-        centre_screen(over, s, given, by.throw)
-    mag, margin = by.mag, default("margin") if by.margin is None else by.margin
-    check("lens.size", lens["size"])
-    if check("screen.z", screen["z"]) == 0:
-        raise InputError("⟨screen.z⟩ must lie behind the lens, or before a mirror, got 0 mm")
-    if "size" in screen:
-        check("screen.size", screen["size"])
-    if "size" in target:
-        check("target.size", target["size"])
-    check("target.flip", target["flip"])
-    check("target.encoding", target["encoding"])
-    complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
+    s, by = Settings.of(given), by or Parameters()
+    if s.target.sheet:
+        aspect, lit = _aspect_of_a_sheet(s, aspect), (1.0, 1.0)
+    s = _in_colour(s) if s.target.color else s
+    over = Ranges.parse(s.design.over)
+    s = s.changed(screen=_placed(s, by, aspect, "z" in given.get("screen", {}), over))
+    check("target.flip", s.target.flip)
+    check("target.encoding", s.target.encoding)
+    s = s.changed(source=complete_source(s.source, s.lens, [stage.get("source", "") for stage in s.design.stages]))
     if over:
-        complete_over(over, s, given)
-    if (over or _relative_to_initial(s["design"])) and "initial" not in given.get("design", {}):
-        s["design"]["initial"] = "zero-last"
-    complete_second(s)
-    if "size" not in target or mag is not None:
-        if mag is None and "size" in screen:
-            fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
-        else:
-            fit = (mag or default_magnification(s)) * lens["size"][0]
-        target["size"] = [fit, fit * aspect]
-    if "size" not in screen:
-        screen["size"] = [(1.0 + margin) * x for x in target["size"]]
-    if "resolution" not in screen:
-        nx = by.resolution[0] if by.resolution else DEFAULT_RESOLUTION
-        screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
-    complete_second_size(s)
-    complete_elements(s)
-    build_screen(s)
-    source = build_source(s)
-    _complete_lens(lens, screen, target, source, sides=2 if "second" in s else 1)
-    _complete_design(s, source, by.quality, by.rays, lit, gaps)
-    return s
+        at = middle_source(over, s.source, "position" in given.get("source", {}))
+        s = s.changed(source=at, design=complete_network(s.design))
+    if over or _relative_to_initial(s.design):
+        s = s.changed(design=s.design if "initial" in given.get("design", {}) else s.design.changed(initial="zero-last"))
+    s = s.changed(second=complete_second(s))
+    s = s.changed(target=complete_target(s, by, aspect))
+    s = s.changed(screen=complete_screen(s.screen, s.target, by))
+    s = s.changed(second=complete_second_size(s))
+    s = s.changed(elements=complete_elements(s))
+    build_screen(s.screen)
+    source = build_source(s.source)
+    s = s.changed(lens=complete_lens(s, source))
+    return _complete_design(s, source, by.quality, by.rays, lit, gaps)
 
 
-def complete_source(source: dict[str, Any], lens: dict[str, Any], stages: Sequence[str] = (), where: str = "⟨source.type⟩") -> None:
-    """Complete the keys of the source types in use, and remove defaults that none of them uses.
+def _aspect_of_a_sheet(s: Settings, aspect: float) -> float:
+    """Height over width of each picture of a contact sheet."""
+    array = check("lens.array", s.lens.array)
+    if max(array) == 1 or s.target.color:
+        raise InputError("⟨target.sheet⟩ needs ⟨+lens.array⟩, and a picture without colours")
+    return aspect * array[0] / array[1]
+
+
+def _in_colour(s: Settings) -> Settings:
+    """Settings with the wavelengths of a coloured picture, and a glass whose dispersion is known."""
+    if s.source.also:
+        raise InputError("[[source]] of a coloured picture must be one, whose three wavelengths are its colours")
+    lens = s.lens if "index" in s.lens else s.lens.filled(glass=COLOR_GLASS)
+    return s.changed(source=s.source.filled(wavelengths=RGB), lens=lens)
+
+
+def _placed(s: Settings, by: Parameters, aspect: float, placed: bool, over: Ranges | None) -> ScreenSettings:
+    """The screen at its distance, with the size and the pixels that are given; placed: whether its distance is given as such."""
+    screen, side = s.screen, -1.0 if s.lens.mirror else 1.0
+    if by.throw is not None:
+        screen = screen.changed(z=side * by.throw)
+    elif not placed:
+        screen = screen.changed(z=side * screen.z)
+    if by.screen_size is not None:
+        width = by.screen_size[0]
+        screen = screen.changed(size=(width, by.screen_size[1] if len(by.screen_size) == 2 else width * aspect))
+    if by.resolution is not None:
+        screen = screen.without("resolution")
+        if len(by.resolution) == 2:
+            screen = screen.changed(resolution=by.resolution)
+    if over and "throw" in over.keys:
+        screen = screen.changed(z=middle_distance(over, screen.z, side, by.throw is not None or placed))
+    check("lens.size", s.lens.size)
+    if check("screen.z", screen.z) == 0:
+        raise InputError("⟨screen.z⟩ must lie behind the lens, or before a mirror, got 0 mm")
+    for section in (screen, s.target):
+        if "size" in section:
+            check(f"{section.section}.size", section["size"])
+    return screen
+
+
+def complete_source(
+    source: SourceSettings, lens: LensSettings, stages: Sequence[str] = (), where: str = "⟨source.type⟩"
+) -> SourceSettings:
+    """The section with the keys of the source types in use, and without defaults that none of them uses.
 
     stages: the source types of the stages, "" for the source's own; their keys are needed, too.
     """
     if "also" in source:
-        source["also"] = [{**DEFAULTS["source"], **table} for table in source["also"]]
-        for table in source["also"]:
-            complete_source(table, lens, where="⟨source.also.type⟩")
-    types = [sources.type_of(source["type"], where)]
+        source = source.changed(also=[complete_source(table, lens, where="⟨source.also.type⟩") for table in source.also])
+    types = [sources.type_of(source.type, where)]
     types += [sources.type_of(type, "⟨design.stages.source⟩") for type in stages if type]
     for type in types:
-        for key, value in type.defaults(lens).items():
-            source.setdefault(key, value)
-    for key in set(DEFAULTS["source"]).difference(sources.COMMON, *(type.keys for type in types)):
-        source.pop(key, None)
+        source = source.filled(**type.defaults(lens))
+    return source.without(*{*SourceSettings.of({})}.difference(sources.COMMON, *(type.keys for type in types)))
+
+
+def complete_target(s: Settings, by: Parameters, aspect: float) -> TargetSettings:
+    """The target with its size on the screen."""
+    if "size" in s.target and "mag" not in by:
+        return s.target
+    if "size" in s.screen and "mag" not in by:
+        width = min(s.screen.size[0], s.screen.size[1] / aspect) / (1.0 + by.margin)
+    else:
+        width = (by.mag if "mag" in by else default_magnification(s)) * s.lens.size[0]
+    return s.target.changed(size=(width, width * aspect))
+
+
+def complete_screen(screen: ScreenSettings, target: TargetSettings, by: Parameters) -> ScreenSettings:
+    """The screen with its size, of the picture and a margin, and its pixels."""
+    screen = screen.filled(size=[(1.0 + by.margin) * x for x in target.size])
+    across = by.resolution[0] if by.resolution else DEFAULT_RESOLUTION
+    return screen.filled(resolution=(across, max(2, round(across * screen.size[1] / screen.size[0]))))
 
 
 def first_thickness(size: Sequence[float]) -> float:
@@ -212,60 +217,49 @@ def first_thickness(size: Sequence[float]) -> float:
     return width / 2.0 if width <= PLATE else WALL + width / 10.0
 
 
-def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any], source: Source, sides: int) -> None:
-    index, scale = index_of(lens), max(lens["size"]) / 10.0
+def complete_lens(s: Settings, source: Source) -> LensSettings:
+    """The lens with its base surface, which spreads the light over the picture, and room for the heights."""
+    index, scale, sides = index_of(s.lens), max(s.lens.size) / 10.0, 1 if s.second is None else 2
     check("lens.index", index)
-    if lens.get("gradient") == "free":
-        complete_blank(lens, screen, index)
-    if "glass" not in lens:
-        lens["index"] = index
-    else:
-        lens.setdefault("wavelength", default("lens.wavelength"))
+    lens = complete_blank(s.lens, s.screen, index) if s.lens.gradient == "free" else s.lens
+    lens = lens.filled(index=index) if lens.glass is None else lens.filled(wavelength=lens.wavelength)
     free = "thickness" not in lens
-    lens.setdefault("thickness", THICK * max(lens["size"]) if sides == 2 else first_thickness(lens["size"]))
-    lens.setdefault("height_range", [-scale, scale] if sides == 1 else [c * SAG * lens["thickness"] for c in (-1.0, 1.0)])
+    lens = lens.filled(thickness=THICK * max(lens.size) if sides == 2 else first_thickness(lens.size))
+    lens = lens.filled(height_range=(-scale, scale) if sides == 1 else [c * SAG * lens.thickness for c in (-1.0, 1.0)])
     if sides == 2:
-        lens.setdefault("radius", [math.inf, math.inf])
-    mirror, array = value_of(lens, "lens.mirror"), check("lens.array", value_of(lens, "lens.array"))
-    if mirror and screen["z"] >= lens["thickness"] + lens["height_range"][0]:
-        raise InputError(
-            f"⟨screen.z⟩ must lie before the mirror, which begins at"
-            f" {lens['thickness'] + lens['height_range'][0]:.4g} mm, got {screen['z']:g} mm"
-        )
-    if not mirror and screen["z"] <= lens["thickness"] + lens["height_range"][1]:
-        raise InputError(
-            f"⟨screen.z⟩ must lie behind the lens, which is up to"
-            f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm"
-        )
+        lens = lens.filled(radius=(math.inf, math.inf))
+    array, z = check("lens.array", lens.array), s.screen.z
+    lowest, highest = (lens.thickness + height for height in lens.height_range)
+    if lens.mirror and z >= lowest:
+        raise InputError(f"⟨screen.z⟩ must lie before the mirror, which begins at {lowest:.4g} mm, got {z:g} mm")
+    if not lens.mirror and z <= highest:
+        raise InputError(f"⟨screen.z⟩ must lie behind the lens, which is up to {highest:.4g} mm thick, got {z:g} mm")
     if "radius" not in lens:
         # The pictures of lenslets are superimposed: the light through their centres converges like that of a focusing lens.
-        across, along = (t / w if k == 1 else 0.0 for t, w, k in zip(target["size"], lens["size"], array, strict=True))
+        across, along = (t / w if k == 1 else 0.0 for t, w, k in zip(s.target.size, lens.size, array, strict=True))
         vergence = 0.0
-        if source.nearest < lens["z_in"]:  # vergence at the surface, 1/mm; 0 for a source at infinity
-            vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / (1.0 if mirror else index))
-        radius = Offset.for_magnification(
-            (across, along), -1.0 if mirror else index, screen["z"], lens["thickness"], vergence
-        ).radius
-        least = STEEPEST * math.hypot(*lens["size"]) / 2.0  # an oblong picture or a near source may ask for a smaller radius
-        lens["radius"] = [math.copysign(max(abs(r), least), r) for r in radius]
-    if free and sides == 1:
-        lens["thickness"] += _missing_room(lens)
+        if source.nearest < lens.z_in:  # vergence at the surface, 1/mm; 0 for a source at infinity
+            vergence = 1.0 / (lens.z_in - source.centre[2] + (lens.thickness - lens.z_in) / (1.0 if lens.mirror else index))
+        radius = Offset.for_magnification((across, along), -1.0 if lens.mirror else index, z, lens.thickness, vergence).radius
+        least = STEEPEST * math.hypot(*lens.size) / 2.0  # an oblong picture or a near source may ask for a smaller radius
+        lens = lens.changed(radius=[math.copysign(max(abs(r), least), r) for r in radius])
+    return lens.changed(thickness=lens.thickness + _missing_room(lens)) if free and sides == 1 else lens
 
 
-def _missing_room(lens: dict[str, Any]) -> float:
+def _missing_room(lens: LensSettings) -> float:
     """Increase of the thickness, mm, with which the base surface keeps the least thickness; 0 if the heights have room already.
 
     A strongly converging lens, for a close source for instance, is thinnest at its corners.
     """
-    x, y = (np.array([0.0, width / 2.0]) for width in lens["size"])
-    lowest = lens["thickness"] + float(Offset(0.0, tuple(lens["radius"])).sag(x[:, None], y[None, :]).min())
-    short = lens["z_in"] + value_of(lens, "lens.min_thickness") - lowest
-    return short if short >= lens["height_range"][1] else 0.0
+    x, y = (np.array([0.0, width / 2.0]) for width in lens.size)
+    lowest = lens.thickness + float(Offset(0.0, lens.radius).sag(x[:, None], y[None, :]).min())
+    short = lens.z_in + lens.min_thickness - lowest
+    return short if short >= lens.height_range[1] else 0.0
 
 
 def shape_words(s: Settings) -> str:
     """A recommendation of a lens shape for an oblong picture; "" if the magnifications are similar."""
-    (w, h), (a, b) = s["target"]["size"], s["lens"]["size"]
+    (w, h), (a, b) = s.target.size, s.lens.size
     if OBLONG > h * a / (w * b) > 1.0 / OBLONG:
         return ""
     width = math.sqrt(a * b * w / h)
@@ -276,7 +270,16 @@ def shape_words(s: Settings) -> str:
 
 
 def _complete_design(
-    s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float], gaps: float
+    full: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float], gaps: float
+) -> Settings:
+    s = tables_of(full)
+    _complete_tables(s, source, quality, rays, lit, gaps)
+    design = s["design"] | {"stages": [StageSettings(stage) for stage in s["design"]["stages"]]}
+    return full.changed(lens=LensSettings(s["lens"]), design=DesignSettings(design))
+
+
+def _complete_tables(
+    s: Given, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float], gaps: float
 ) -> None:
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = check("lens.degree", lens["degree"])
@@ -349,7 +352,7 @@ def _complete_design(
         centre = source.pointlike() if spread else source
         # Diffraction smooths creases more than a coarser net, and the pixels of a tilted screen do not coincide with those that the
         # map is solved for, which shows as lines: a flame at 30 degrees has an error of 0.205 on the finer net and 0.087 without.
-        aligned = source.distant and build_screen(s).upright
+        aligned = source.distant and build_screen(Settings.of(s).screen).upright
         creased = gaps >= GAPS and not (own or waves or spread) and aligned and max(array) == 1
         if creased:
             lens["control"] = [creased_control(max(nx, ny), p, quality) for p in degree]
@@ -378,7 +381,7 @@ def _complete_design(
     design["stages"] = stages
 
 
-def _relative_to_initial(design: dict[str, Any]) -> bool:
+def _relative_to_initial(design: Mapping[str, Any]) -> bool:
     """Whether the design uses a network whose outputs are relative to an initial surface."""
     return design["network"] != "none" and design.get("preconditioner") == "laplacian"
 
@@ -388,22 +391,22 @@ def _of_array(control: Sequence[int], degree: Sequence[int], array: Sequence[int
     return [array_control(n, p, k) if k > 1 else n for n, p, k in zip(control, degree, array, strict=True)]
 
 
-def without_waves(s: Settings, given: bool) -> str:
+def without_waves(full: Settings, given: bool) -> str:
     """Why `waves = "auto"` omits the wave image from complete settings although diffraction matters, and how to include it.
 
     given: whether the stages are user-defined.
     """
-    design = s["design"]
-    if any(stage.get("waves") for stage in design["stages"]):
+    s = tables_of(full)
+    if any(stage.waves for stage in full.design.stages):
         return ""
     if given:
         return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
-    if (seen := _resolution(s, build_source(s))).source > seen.pixel:
+    if (seen := _resolution(s, build_source(full.source))).source > seen.pixel:
         return "that of a source whose blur is wider than a pixel takes many times as long; ⟨waves⟩ on refines it all the same"
     return _not_by_default(s) or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; ⟨waves⟩ on takes it"
 
 
-def _not_by_default(s: Settings) -> str:
+def _not_by_default(s: Given) -> str:
     """The feature for which `waves = "auto"` never refines the wave image, and how to include it; "" if there is none."""
     design = s["design"]
     if "gradient" in s["lens"]:
@@ -418,7 +421,7 @@ def _not_by_default(s: Settings) -> str:
         return "a network is trained on rays alone; ⟨network⟩ none refines it"
     if design["optimizer"] != "lbfgs":
         return f"{design['optimizer']} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it"
-    if build_screen(s).curved:
+    if build_screen(Settings.of(s).screen).curved:
         return "a curved screen has no wave image"
     if max(value_of(s["lens"], "lens.array")) > 1:
         return "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on refines it"
@@ -427,7 +430,7 @@ def _not_by_default(s: Settings) -> str:
     return ""
 
 
-def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Table]:
+def _wave_stages(s: Given, source: Source, quality: str, lit: tuple[float, float]) -> list[Table]:
     """Stages that refine the wave image after the ray image, on request or where diffraction matters."""
     design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
     if asked == "on" and design["network"] != "none":
@@ -436,7 +439,7 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
         raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
     if asked == "on" and source.rays is not None:
         raise InputError("⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine")
-    if asked == "on" and build_screen(s).curved:
+    if asked == "on" and build_screen(Settings.of(s).screen).curved:
         raise InputError("⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine")
     if asked == "on" and len(source.members) > 1:
         raise InputError("⟨design.waves⟩ on needs one source: light of several is refined by rays alone")
@@ -451,12 +454,14 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
     return [on_waves(lens["control"], list(map(float, own)) or white(count), apron, n) for count, n in plan]
 
 
-def _resolution(s: Settings, source: Source) -> Resolution:
+def _resolution(s: Given, source: Source) -> Resolution:
     """The resolution limit of complete settings."""
-    return Resolution.before(Scene(source, build_lens(s), build_screen(s), build_light(s)), tuple(s["target"]["size"]))
+    full = Settings.of(s)
+    scene = Scene(source, build_lens(full.lens), build_screen(full.screen), build_light(full))
+    return Resolution.before(scene, full.target.size)
 
 
-def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
+def _wave_samples(s: Given, seen: Resolution, lit: tuple[float, float]) -> float:
     """Estimated number of samples of the field at one wavelength: space-bandwidth product of the lens and the blurred bright
     region."""
     throw, shortest = abs(s["screen"]["z"]), min(s["source"].get("wavelengths", []) or BAND[:1]) * 1e-6
@@ -472,10 +477,11 @@ def _quality(time_limit: float, source: Source) -> str:
     return "draft" if seconds < DRAFT_SECONDS else "fine" if FINE_SECONDS <= seconds < math.inf else "standard"
 
 
-def _shifts(s: Settings, source: Source) -> bool:
+def _shifts(s: Given, source: Source) -> bool:
     """Whether the source's extent only shifts the image."""
-    lens = build_lens({**s, "lens": {"control": [LEAST_SPANS] * 2, **s["lens"]}})
-    return source_spread(Scene(source, lens, build_screen(s), build_light(s))) is not None
+    full = Settings.of(s)
+    lens = build_lens(full.lens.filled(control=[LEAST_SPANS] * 2))
+    return source_spread(Scene(source, lens, build_screen(full.screen), build_light(full))) is not None
 
 
 def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, per_pixel2: float | None = None) -> Filter:
@@ -499,63 +505,59 @@ def build_stages(settings: Settings) -> list[Stage]:
     Raises:
         InputError: there are none, a value is out of range, or the last stage does not use the lens' control net.
     """
-    stages = [stage_of(table, settings) for table in settings["design"].get("stages", [])]
+    stages = [stage_of(table, settings) for table in settings.design.stages]
     if not stages:
         raise InputError("[[design.stages]] at least one stage is needed")
-    if list(stages[-1].control) != list(settings["lens"]["control"]):
+    if stages[-1].control != settings.lens.control:
         raise InputError(
             f"[[design.stages]] the last stage's control {list(stages[-1].control)} must be the lens' own,"
-            f" {settings['lens']['control']}"
+            f" {list(settings.lens.control)}"
         )
     return stages
 
 
-def stage_of(table: Table, settings: Settings) -> Stage:
+def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
     """The stage of a table of complete settings."""
-    t = stage_base(settings, "grid") | table
-    filter = filter_from(
-        t["reconstruction"], t["filter_size"], build_screen(settings), t.get("alpha_per_mm2"), t.get("alpha_per_pixel2")
-    )
-    source = build_source(settings, type=t["source"]) if "source" in t else None
+    t = StageSettings(stage_base(tables_of(settings), "grid"), table)
+    filter = filter_from(t.reconstruction, t.filter_size, build_screen(settings.screen), t.alpha_per_mm2, t.alpha_per_pixel2)
     return Stage(
-        tuple(t["control"]),
-        t["rays"],
-        t["sampler"],
+        t.control,
+        t.rays,
+        t.sampler,
         filter,
-        t["blur"],
-        t["apron"],
-        t["iterations"],
-        t["tolerance"],
-        source,
-        t["oversample"],
-        tuple(t.get("waves", ())),
-        value_of(t, "design.stages.spread"),
-        value_of(t, "design.stages.lenslets"),
+        t.blur,
+        t.apron,
+        t.iterations,
+        t.tolerance,
+        None if t.source is None else build_source(settings.source, type=t.source),
+        t.oversample,
+        t.waves or (),
+        t.spread,
+        t.lenslets,
     )
 
 
 def build_options(settings: Settings) -> Options:
     """The design options of complete settings."""
-    d = settings["design"]
-    for key in ("dtype", "seed", "iterations"):
-        check(f"design.{key}", d[key])
+    d = settings.design
+    check_all("design", d, "dtype", "seed", "iterations")
     for key in ("time_limit", "checkpoint_every"):  # which may be infinite
         if not d[key] > 0:
             raise InputError(f"⟨design.{key}⟩ must be greater than 0 s, got {d[key]:g}")
     return Options(
-        d["loss"],
-        d["optimizer"],
-        d["lr"],
-        d["network"],
-        d["initial"],
-        d["preconditioner"],
-        d["filter_target"],
-        d["seed"],
-        getattr(torch, d["dtype"]),
-        d["max_slope"],
-        d["min_radius"],
-        d["waves"] == "on",
+        d.loss,
+        d.optimizer,
+        d.lr,
+        d.network,
+        d.initial,
+        d.preconditioner,
+        d.filter_target,
+        d.seed,
+        getattr(torch, d.dtype),
+        d.max_slope,
+        d.min_radius,
+        d.waves == "on",
         content(d, "robust", Tolerances),
-        Architecture(*(value_of(d, f"design.{key}") for key in ("network_layers", "network_width", "activation"))),
-        Ranges.parse(value_of(d, "design.over")),
+        Architecture(d.network_layers, d.network_width, d.activation),
+        Ranges.parse(d.over),
     )

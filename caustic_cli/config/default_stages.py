@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from caustic_cli.config.settings import Settings
+from caustic_cli.config.settings import Given
 from caustic_cli.config.table import check, default
 from caustic_cli.inverse.initial_surface import COARSE
 from caustic_cli.scene import Source
@@ -66,13 +66,13 @@ def usual_sampler(source: Source) -> str:
     return "lines" if source.collimated else "stratified"
 
 
-def completed_stage(table: Table, s: Settings, sampler: str) -> Table:
+def completed_stage(table: Table, s: Given, sampler: str) -> Table:
     """A user-defined stage with its missing keys completed."""
     base = stage_base(s, sampler)
     return {**({k: base[k] for k in WAVE_KEYS} if table.get("waves") else base), **table}
 
 
-def stage_base(s: Settings, sampler: str) -> Table:
+def stage_base(s: Given, sampler: str) -> Table:
     """Defaults of a user-defined stage."""
     nx, ny = s["screen"]["resolution"]
     return on_rays(

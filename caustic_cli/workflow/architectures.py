@@ -110,10 +110,10 @@ def candidates(
     if project is None:
         full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
         scene = build_scene(full)
-        target = disc(scene, tuple(full["target"]["size"]))
+        target = disc(scene, full.target.size)
     else:
-        if project.over is not None and project.settings["design"]["start"] != "offset":
-            project, first = first_heights(project, project.settings)
+        if project.over is not None and project.settings.design.start != "offset":
+            project, first = first_heights(project, {"lens": dict(project.settings.lens)})
         full, scene = project.settings, project.scene()
         target = project.target(scene)
     stages = [s for s in build_stages(full) if not s.waves]

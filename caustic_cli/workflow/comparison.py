@@ -125,7 +125,7 @@ def timed_designs(
     if project is None:
         full = complete({"screen": {"resolution": [PIXELS, PIXELS]}, "lens": {"control": [CONTROL, CONTROL]}}, 1.0)
         scene = settings.build_scene(full)
-        target = disc(scene, tuple(full["target"]["size"]))
+        target = disc(scene, full.target.size)
     else:
         full, scene = project.settings, project.scene()
         target = project.target(scene)
@@ -138,7 +138,7 @@ def lens_of_disc() -> tuple[Scene, HeightField, Tensor]:
     full = complete({}, 1.0)
     scene = settings.build_scene(full)
     field = HeightField.of(scene.lens)
-    return scene, field, first_surface(scene, disc(scene, tuple(full["target"]["size"])), field, LEAST_CELLS).heights
+    return scene, field, first_surface(scene, disc(scene, full.target.size), field, LEAST_CELLS).heights
 
 
 def disc(scene: Scene, size: tuple[float, float]) -> np.ndarray:
@@ -196,7 +196,7 @@ def variants(
         if lens.knots is not None
         else tuple(min(n, max(NETWORK_CONTROL, p + 1)) for n, p in zip(lens.control, lens.degree, strict=True))
     )
-    if full["design"]["start"] == "transport":
+    if full.design.start == "transport":
         found.append((TRANSPORT, [replace(last, control=lens.control)], newton))
     adam = replace(options, optimizer="adam", initial="zero", preconditioner="none")
     for kind in ("none", "sparse", "dense"):

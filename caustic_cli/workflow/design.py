@@ -5,7 +5,6 @@ Nothing is written before everything the user gave has been checked.
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import math
 import signal
@@ -21,11 +20,11 @@ import numpy as np
 import torch
 
 from caustic_cli import __version__
-from caustic_cli.config import presets, settings
-from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, shape_words, without_waves
+from caustic_cli.config import settings
+from caustic_cli.config.completion import PLATE, WALL, build_options, build_stages, complete, shape_words
 from caustic_cli.config.default_stages import transport_cells
-from caustic_cli.config.settings import Settings, value_of
-from caustic_cli.config.table import TABLE
+from caustic_cli.config.settings import Given
+from caustic_cli.config.table import TABLE, LensSettings
 from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
@@ -34,21 +33,21 @@ from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.lenslets import initial_array
 from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
-from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.sharpness import advice
 from caustic_cli.inverse.source_limits import best_irradiance, point_source, source_spread
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
-from caustic_cli.io.picture import Picture, read_picture
+from caustic_cli.io.picture import Picture
 from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.optics.emission.measured import coarse_words
-from caustic_cli.optics.obstruction import clear_shift, refuse_obstructed
+from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
-from caustic_cli.project import attachments, directory, uptodate
+from caustic_cli.project import directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.new import new_project
 from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, Project, is_project
 from caustic_cli.scene import Scene
@@ -99,76 +98,7 @@ def begin(
     Raises:
         InputError: invalid input; nothing was written.
     """
-    read = [settings.read(path, parameters=True) for path in (preset and presets.path_of(preset), config) if path]
-    if config and "source" in read[-1]:
-        read[-1]["source"] = attachments.attached(read[-1]["source"], config.parent)
-    if config and "design" in read[-1]:
-        read[-1]["design"] = attachments.with_errors(read[-1]["design"], config.parent)
-    if config and "screen" in read[-1]:
-        read[-1]["screen"] = attachments.with_shape(read[-1]["screen"], config.parent)
-    if config and "lens" in read[-1]:
-        read[-1]["lens"] = attachments.with_index(read[-1]["lens"], config.parent)
-    chosen = settings.by_section(given)
-    said = settings.merged({}, *map(settings.implied, (*read, chosen)))
-    if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given at the same level
-        glass = said["lens"].pop("glass")
-        say.say(f"⟨lens.index⟩ {said['lens']['index']:g} is used at all wavelengths, and {glass} is ignored")
-    if "design" in said:
-        said["design"] = attachments.with_errors(said["design"])
-    if "screen" in said:
-        said["screen"] = attachments.with_shape(said["screen"])
-    parameters = said.pop("", {})
-    invert = parameters.pop("invert", False)
-    if "elements" in parameters:  # those of the command line replace those of a configuration
-        said["element"] = {"list": parameters.pop("elements")}
-    by = Derivation(**parameters)
-    if "source" in said:
-        said["source"] = attachments.attached(said["source"])
-    if "lens" in said:
-        said["lens"] = attachments.with_index(said["lens"])
-    goal = said.get("target", {})
-    picture = (
-        target
-        if isinstance(target, Picture)
-        else read_picture(target, goal.get("encoding") == "linear", goal.get("color", False), invert)
-    )
-    if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
-        del said["source"]["weights"]
-    if goal.get("color", False):
-        if isinstance(target, Picture):
-            raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
-        light = [float(c) for c in picture.irradiance().sum((1, 2))]
-        said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
-    profile = said.get("source", {}).get("profile")
-    light = read_picture((config.parent if config else Path()) / profile, linear=True) if profile else None
-    full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
-    for key in ("index_range", "index_control", "index_layers"):
-        if f"lens.{key}" in given and full["lens"].get("gradient") != "free":
-            raise InputError(f"⟨lens.{key}⟩ belongs to ⟨+lens.gradient⟩ free")
-    if value_of(full["lens"], "lens.mirror") and "shift" not in full["screen"] and any(shift := _beside_the_light(full)):
-        said["screen"] = said.get("screen", {}) | {"shift": list(shift)}
-        full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
-        say.say(f"the screen is shifted by {shift[0]:g},{shift[1]:g} mm, beside the light of its source; ⟨+screen.shift⟩ places it")
-    settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
-    farther = full.get("second", {}).get("file")
-    second = None
-    if farther:
-        at = config.parent if config and "file" not in chosen.get("second", {}) else Path()
-        second = read_picture(at / farther, goal.get("encoding") == "linear", False, invert)
-        full["second"]["file"] = f"second{second.suffix}"
-    full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
-    if light is not None:
-        full["source"]["profile"] = f"profile{light.suffix}"
-    attachments.named_in_project(full)
-    project = Project(
-        out,
-        full,
-        picture,
-        light,
-        second,
-        uptodate.digest(full, picture, light, second),
-        without_waves=without_waves(full, "stages" in said.get("design", {})),
-    )
+    project, said = new_project(target, given, preset, config, out, say.say)
     if recorded and is_free(project):
         raise InputError("⟨movie⟩ records the design of a surface; ⟨lens.gradient⟩ free designs the index")
     if out is not None and not force:
@@ -183,7 +113,7 @@ def begin(
     if designer.scene.second is None and not designer.scene.elements:
         for scene in designer.scenes:
             refuse_unreachable(scene, grey(goal))
-    if words := shape_words(full):
+    if words := shape_words(project.settings):
         say.say(words)
     compile_usual(device, say)
     with (
@@ -193,7 +123,7 @@ def begin(
         try:
             project, first = first_heights(project, said)
         except OutOfReach as error:
-            most = largest_magnification(designer.scene, project.settings["target"]["size"])
+            most = largest_magnification(designer.scene, project.settings.target.size)
             most = min(most or 0.0, TABLE["mag"].high)
             within = f"; ⟨+mag⟩ of at most about {at_most(most, 2)} is within reach at this throw" if most else ""
             raise InputError(f"{error}{within}") from error
@@ -202,33 +132,35 @@ def begin(
     return project, first
 
 
-def _beside_the_light(full: Settings) -> tuple[float, float]:
-    """Shift (x, y) mm of a mirror's screen with which it is nowhere in the light of its source; 0 if there is none."""
-    scene, over = settings.build_scene(full), Ranges.parse(value_of(full["design"], "design.over"))
-    return clear_shift([scene] if over is None else over.ends(scene)) or (0.0, 0.0)
-
-
-def first_heights(project: Project, said: Settings) -> tuple[Project, InitialHeights | None]:
+def first_heights(project: Project, said: Given) -> tuple[Project, InitialHeights | None]:
     """Initial heights of a design, None for the offset surface; and the project with thickness and height range adapted to them,
     except for values `said` by the user.
 
     Raises:
         InputError: as of `begin`.
     """
-    fixed, project = "thickness" in said.get("lens", {}), replace(project, settings=copy.deepcopy(project.settings))
-    lens = project.settings["lens"]
+    fixed = "thickness" in said.get("lens", {})
     first, middle = _solved(project, fixed)
-    if "second" in project.settings:
+    if project.settings.second is not None:
         return project, _designer(project, "cpu")[0].initial_heights(first)
     if middle is not None:
-        lens["thickness"] = middle
-    if first is not None and not fixed and (spare := _spare(lens, said, first)) > 0:
-        lens["thickness"] -= spare
-        first, middle = _solved(project, fixed=True)[0], lens["thickness"]
-    if first is not None and _make_room(project.settings, said, first) and middle is None:
-        _designer(project, "cpu")
-        first, _ = _solved(project, fixed)
+        project = _with_lens(project, thickness=middle)
+    if first is not None and not fixed and (spare := _spare(project.settings.lens, said, first)) > 0:
+        middle = project.settings.lens.thickness - spare
+        project = _with_lens(project, thickness=middle)
+        first = _solved(project, fixed=True)[0]
+    if first is not None and (room := _room(project.settings.lens, said, first)):
+        project = _with_lens(project, **room)
+        if middle is None:
+            _designer(project, "cpu")
+            first, _ = _solved(project, fixed)
     return project, _designer(project, "cpu")[0].initial_heights(first)
+
+
+def _with_lens(project: Project, **values: Any) -> Project:
+    """The project with other settings of its lens."""
+    full = project.settings
+    return replace(project, settings=full.changed(lens=full.lens.changed(**values)))
 
 
 @dataclass(frozen=True)
@@ -292,16 +224,16 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
         say.say(f"{ground:.0%} of the picture are at its maximum: for a drawing on white, ⟨invert⟩ makes the lines bright")
     if coarse := coarse_words(designer.scene):
         say.say(coarse)
-    seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
+    seen = Resolution.before(designer.scene, project.settings.target.size)
     if not designer.scene.elements:
         say.say(seen.sentence())
-    timed = math.isfinite(project.settings["design"]["time_limit"])
+    timed = math.isfinite(project.settings.design.time_limit)
     words = designer.source_limits(SMOOTH_STEPS if timed else None).sentence()
     if words:
         say.say(words)
     if designer.scene.joint:
         return
-    if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
+    if seen.matters and project.settings.design.waves == "auto" and project.without_waves:
         say.say(f"the wave image is not refined: {project.without_waves}")
     field = designer.field(0)
     heights = designer.begin().heights if first is None else first.heights
@@ -347,8 +279,8 @@ def resume(
             )
         state = designer.restored(state)
         if iterations is not None:
-            changed = project.settings["design"] | {"iterations": iterations}
-            project = replace(project, settings=project.settings | {"design": changed})
+            changed = project.settings.design.changed(iterations=iterations)
+            project = replace(project, settings=project.settings.changed(design=changed))
             project.write_settings()
         project = replace(project, asked=uptodate.asked_of(project, before) if begun else uptodate.begun(project))
         return _run(project, designer, target, state, say, began, time_limit, device, movie)
@@ -360,7 +292,7 @@ def follow(device: str) -> None:
         while task := ranks.receive():
             *parts, state, limit = task
             project = Project(None, *parts)
-            _designer(project, device)[0].run(state, iterations=project.settings["design"]["iterations"], time_limit=limit)
+            _designer(project, device)[0].run(state, iterations=project.settings.design.iterations, time_limit=limit)
 
 
 def _on_cpu(state: State) -> State:
@@ -406,7 +338,7 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
     Raises:
         InputError: the project or surface cannot be read, its lens has another size, or the picture cannot be reached.
     """
-    start = project.settings["design"]["start"]
+    start = project.settings.design.start
     if start == "offset":
         return _aimed_offset(project), None
     if start == "transport":
@@ -425,7 +357,7 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
             cells = max(LEAST_CELLS, cells // max(scene.lens.array))
             found = InitialSurface(initial_array(scene, goals, designer.stages[0].control, cells).heights)
         else:
-            seconds = START_PART * project.settings["design"]["time_limit"]
+            seconds = START_PART * project.settings.design.time_limit
             found = first_surface(scene, goal, designer.field(0), cells, fixed, seconds)
         lens = designer.scene.lens
         short = lens.z_in + lens.min_thickness - float(found.heights.min())
@@ -440,10 +372,9 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
         )
     other = Project.open(start)
     _, field, heights, _ = other.lens(other.scene())
-    if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
-        raise InputError(
-            f"⟨design.start⟩: the lens of {start} is {other.settings['lens']['size']} mm, not {project.settings['lens']['size']} mm"
-        )
+    sizes = [list(one.settings.lens.size) for one in (other, project)]
+    if sizes[0] != sizes[1]:
+        raise InputError(f"⟨design.start⟩: the lens of {start} is {sizes[0]} mm, not {sizes[1]} mm")
     return onto(field, heights, net), None
 
 
@@ -451,7 +382,7 @@ def _aimed_offset(project: Project) -> torch.Tensor | None:
     """The offset surface with the slope that turns its light to the centre of a shifted screen; None for one that is not shifted,
     or for a network, whose heights are relative to the offset surface."""
     scene, shift = project.scene(), project.scene().screen.shift
-    if not any(shift) or project.settings["design"]["network"] != "none":
+    if not any(shift) or project.settings.design.network != "none":
         return None
     lens = scene.lens
     x, y = (c.numpy() for c in _designer(project, "cpu")[0].field(0).control_xy())
@@ -459,28 +390,27 @@ def _aimed_offset(project: Project) -> torch.Tensor | None:
     return torch.from_numpy(lens.offset.heights(x, y) + slope[0] * x[:, None] + slope[1] * y[None, :])
 
 
-def _spare(lens: dict[str, Any], said: Settings, first: torch.Tensor) -> float:
+def _spare(lens: LensSettings, said: Given, first: torch.Tensor) -> float:
     """Excess thickness of a plate below its initial surface beyond the wall, which may be given, mm; 0 for another lens."""
-    if max(lens["size"]) <= PLATE:
+    if max(lens.size) <= PLATE:
         return 0.0
-    wall = lens["min_thickness"] if "min_thickness" in said.get("lens", {}) else WALL
-    return max(0.0, float(first.min()) - lens["z_in"] - wall)
+    wall = lens.min_thickness if "min_thickness" in said.get("lens", {}) else WALL
+    return max(0.0, float(first.min()) - lens.z_in - wall)
 
 
-def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:
-    """Widen height_range and thickness as the initial surface requires, unless the user fixed them; True if they changed."""
-    lens = settings.build_lens(full)
+def _room(given: LensSettings, said: Given, first: torch.Tensor) -> dict[str, Any]:
+    """Height range and thickness as the initial surface requires, where it needs others and the user fixed none."""
+    lens = settings.build_lens(given)
     offset = HeightField.of(replace(lens, control=tuple(first.shape)))
     x, y = (c.numpy() for c in offset.control_xy())
     base = lens.offset.heights(x, y)
     departure = 2.0 * float(np.abs(first.numpy() - base).max())
     short = lens.z_in + lens.min_thickness - float(first.min())
-    fixed, changed = said.get("lens", {}), False
+    fixed, changed = said.get("lens", {}), dict[str, Any]()
     if departure > lens.height_range[1] and "height_range" not in fixed:
-        full["lens"]["height_range"], changed = [-departure, departure], True
+        changed["height_range"] = (-departure, departure)
     if short > 0 and "thickness" not in fixed:
-        full["lens"]["thickness"] += 1.5 * short + 0.02 * max(lens.size)
-        changed = True
+        changed["thickness"] = given.thickness + (1.5 * short + 0.02 * max(lens.size))
     return changed
 
 
@@ -495,8 +425,8 @@ def _run(
     device: str,
     movie: Movie | None = None,
 ) -> Result:
-    chosen = project.settings["design"]
-    limit = chosen["time_limit"] if time_limit is None else time_limit
+    chosen = project.settings.design
+    limit = chosen.time_limit if time_limit is None else time_limit
     timed = math.isfinite(limit)
     if timed:  # the limit includes the initial surface and the evaluation
         after = expected_seconds(designer, target, state, device)
@@ -504,7 +434,7 @@ def _run(
     records = _Records(project, designer, device)
     if movie is not None:
         movie.screen = designer.scene.screen
-    total = chosen["iterations"] or sum(s.iterations for s in designer.stages)
+    total = chosen.iterations or sum(s.iterations for s in designer.stages)
     with _signals(project.path is not None) as asked, ExitStack() as shown:
         show = shown.enter_context(say.progress(total))
         stage, saved = -1, time.monotonic()
@@ -524,26 +454,26 @@ def _run(
                 total,
             )
             if movie is not None:
-                movie.record(now, target, project.settings["target"]["encoding"], bool(designer.stages[stage].waves))
+                movie.record(now, target, project.settings.target.encoding, bool(designer.stages[stage].waves))
             keep_if_due(now)
 
         def keep_if_due(now: State) -> None:
             nonlocal saved
-            if time.monotonic() - saved >= max(chosen["checkpoint_every"], RARELY * (records.seconds - QUICK)):
+            if time.monotonic() - saved >= max(chosen.checkpoint_every, RARELY * (records.seconds - QUICK)):
                 saved = time.monotonic()  # before writing, which takes time itself
                 records.keep(now)
 
         records.keep(state)
-        ranks.send((project.settings, project.picture, project.profile, project.second, _on_cpu(state), limit))
+        ranks.send((project.settings, project.picture, _on_cpu(state), limit))
         state = designer.run(
             state,
-            iterations=chosen["iterations"],
+            iterations=chosen.iterations,
             time_limit=limit,
             stop=lambda: bool(asked),
             on_iteration=on_iteration,
             notice=say.say,
         )
-        if not asked and not chosen["iterations"] and chosen["network"] == "none" and state.reason in DONE:
+        if not asked and not chosen.iterations and chosen.network == "none" and state.reason in DONE:
             start, sharp = (None if z is None else rounded(z) for z in (state.start, state.unrounded))
             state = replace(state, start=start, unrounded=sharp, parameters={}, optimizer={})
         if asked:
@@ -576,7 +506,7 @@ def _run(
             raise Interrupted(f"interrupted after the design had ended; {project.path} is complete", 128 + asked[0])
     field = designer.field(found.state.stage)
     scene, heights = split_heights(designer.scene, field, found.state.heights)
-    size = tuple(project.settings["target"]["size"])
+    size = project.settings.target.size
     if not timed and scene.second is None and (words := advice(scene, grey(target), size)):
         say.say(words)
     return Result(project, scene, field, heights, target, found.state, figures)
@@ -638,7 +568,7 @@ def provenance(project: Project, device: str) -> dict[str, Any]:
         "numpy": np.__version__,
         "device": device,
         "threads": torch.get_num_threads(),
-        "seed": project.settings["design"]["seed"],
+        "seed": project.settings.design.seed,
         "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
     }
 

@@ -71,11 +71,11 @@ def evaluate_and_write(
     project: Project, designer: Designer, target: np.ndarray, state: State, device: str, timed: bool = False
 ) -> Evaluation:
     """Evaluate the finished lens; write render.png, wave.png and report.png into the project, if it has a directory."""
-    chosen = project.settings["design"]
-    found = evaluate(designer, target, state, device, chosen["seed"], tuple(project.settings["target"]["size"]), timed)
+    chosen = project.settings.design
+    found = evaluate(designer, target, state, device, chosen.seed, project.settings.target.size, timed)
     if project.path is None:
         return found
-    encoding = project.settings["target"]["encoding"]
+    encoding = project.settings.target.encoding
     seen, aim = (irradiance(a, designer.scene.screen) for a in (found.image, target))
     made = uptodate.image_provenance(project, found.state.heights, found.figures)
     write_image(project.path / RENDER, seen, white_level(seen, aim), encoding, WIDE, made)

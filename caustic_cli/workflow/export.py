@@ -283,7 +283,7 @@ def exporter_of(project: Path, at: str | None, say: Reporter, most: float = MOST
     target = opened.target(scene)
     scene, field, heights, checkpoint = opened.lens(scene)
     waves = checkpoint.results.get("wave_relative_rms") is not None and checkpoint.results.get("error_by", "waves") == "waves"
-    return Exporter(scene, field, heights, target, waves, opened.settings["design"]["seed"], most, say), opened
+    return Exporter(scene, field, heights, target, waves, opened.settings.design.seed, most, say), opened
 
 
 #: How to have formats of splines exactly.
