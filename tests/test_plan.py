@@ -80,7 +80,7 @@ def test_no_ray_breaks_a_proof(source, bumps):
         assert traced.first == len(traced.system.elements) - 1
         interaction = traced.trace_element(traced.first, traced.start, heights)
         alive = interaction.state.power > 0
-        o, d = ([c[alive] for c in interaction.state.full(v)] for v in (interaction.local, interaction.state.direction))
+        o, d = ([c[alive] for c in interaction.state.full(v)] for v in (interaction.hit.local, interaction.state.direction))
         if not plan["secondary-intersection"].on:
             _, found = next_intersection(field, heights, o, d, below=False)
             assert not bool(found.any())

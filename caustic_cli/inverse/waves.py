@@ -25,7 +25,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves.image import Imager, Line, lines_of
 from caustic_cli.optics.waves.propagation import TURN, power_on_pixels
-from caustic_cli.optics.waves.receiver import receiver_of
+from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.optics.waves.wavefront import Wavefront
 from caustic_cli.scene import Scene
 

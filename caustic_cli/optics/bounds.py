@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError, at_most
-from caustic_cli.optics.gradient.fields import index_field_of
 from caustic_cli.optics.interface import reflectance, reflectances
+from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -83,11 +83,9 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     least, most = min(indices), max(indices)
     pupil = scene.pupil
     incidence = _through(scene, scene.source.incidence(pupil.half_size, pupil.z, pupil.round))
-    bent, depth = 0.0, float(heights.max()) - lens.z_in
-    if field_of_index := index_field_of(lens):
-        low, high, steepest = field_of_index.extremes(lens.half_size, depth)
-        least, most = least * low / lens.index, most * high / lens.index
-        bent = steepest * depth / low
+    depth = float(heights.max()) - lens.z_in
+    low, high, steepest = medium_of(lens).variation(lens.half_size, depth)
+    least, most, bent = least * low, most * high, steepest * depth / (low * lens.index)
     front = 0.0 if lens.entrance is None else math.atan(math.hypot(*entrance_of(lens).slope_bounds(None)))
     inside = min(front + math.asin(max(-1.0, min(1.0, math.sin(incidence - front) / least))) + bent, 0.5 * math.pi)
     slope = field.slope_bound(heights) + steeper

@@ -138,3 +138,17 @@ class RayState:
             u, v = (torch.broadcast_to(c, s.shape).reshape(-1) for c in (s.u[:, None], s.v[None, :]))
             s = replace(s, u=u, v=v, tensor=False)
         return replace(self, origin=(x, y, self.origin[2]), power=power, sample=s, lost=dict(self.lost))
+
+
+@dataclass
+class Hit:
+    """Where rays meet a surface, in its element's frame."""
+
+    #: Points of intersection, mm.
+    local: tuple
+    #: Unit directions in front of the surface.
+    incoming: tuple
+    #: Slopes of the surface.
+    slopes: tuple
+    #: Length of the path to it, mm.
+    length: Tensor | float = 0.0

@@ -56,6 +56,11 @@ class Light:
             )
 
     @property
+    def effects(self) -> frozenset[str]:
+        """Names of the effects on rays that it causes."""
+        return frozenset(() if self.polarisation is None else {"polarisation"})
+
+    @property
     def parts(self) -> tuple[float, ...]:
         """Fraction of the power at each wavelength; they sum to 1."""
         weights = self.weights or (1.0,) * len(self.wavelengths)

@@ -26,7 +26,8 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.resolution import GREEN, Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.optics.waves import NoWaveImage, wave_image
+from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Scene
 from caustic_cli.studies.measurement import Reference
 from caustic_cli.studies.metrics import relative_rms

@@ -17,9 +17,8 @@ from caustic_cli.optics.emission.coherent import modes
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import expose
-from caustic_cli.optics.waves import lines_of, wave_image
-from caustic_cli.optics.waves.image import Imager
-from caustic_cli.optics.waves.receiver import receiver_of
+from caustic_cli.optics.waves.image import Imager, lines_of, wave_image
+from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.scene import Disc, Light, PlaneWave, Points, Screen
 
 DOUBLE = torch.float64

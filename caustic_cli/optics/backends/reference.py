@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics import intersection, reintersection
+from caustic_cli.optics.backends import Fused
 from caustic_cli.optics.gradient.integrator import ORDER, Flow, flow
 from caustic_cli.optics.interface import OutgoingRays, interact
 from caustic_cli.optics.mesh import TriangleMesh
@@ -18,9 +18,6 @@ from caustic_cli.optics.sampling import Sample, scattered_points
 from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Screen
-
-#: A fused kernel: heights, screen and filter -> image, power behind the surface, and losses there.
-Fused = Callable[[Tensor, Screen, Filter], tuple[Tensor, Tensor, dict]]
 
 
 class Torch:

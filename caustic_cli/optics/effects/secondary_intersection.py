@@ -62,7 +62,7 @@ class SecondaryHits(Action):
         element, state, side = m.element, m.state, m.side
         surface, pose, heights = element.surface, element.pose, parameters[element.name]
         round_, interact = element.aperture.round, tracer.backend.interact
-        full = state.full((*m.local, *rotate_to_local(pose, state.direction)))
+        full = state.full((*m.hit.local, *rotate_to_local(pose, state.direction)))
         full = [c.double() for c in full]
         t, met = next_intersection(surface, heights, full[:3], full[3:], below=(side > 0) == m.reflects, round=round_)
         met = met & (state.power > 0)

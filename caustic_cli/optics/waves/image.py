@@ -21,14 +21,15 @@ from torch import Tensor
 
 from caustic_cli.optics.emission.coherent import Mode, central_mode, modes, outermost_modes, spots
 from caustic_cli.optics.interaction import Parameters
+from caustic_cli.optics.receiver import NormalPlane, Receiver
 from caustic_cli.optics.resolution import WHITE_LINES, white
 from caustic_cli.optics.spread import Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.waves.propagation import cells, phase_of, power_by_blocks, power_on_pixels
-from caustic_cli.optics.waves.receiver import Plane, Receiver, receiver_of
-from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling, memory_free
+from caustic_cli.optics.waves.sampling import Sampling, memory_free
 from caustic_cli.optics.waves.tilted import power_on_tilted
+from caustic_cli.optics.waves.unsupported import NoWaveImage, receiver_of
 from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, distance_of, survey, wavefront
 from caustic_cli.scene import Light, Scene, Screen, Source
 from caustic_cli.scene.materials import refractive_index
@@ -219,7 +220,7 @@ class Imager:
 
     source: Source
     receiver: Receiver
-    plane: Plane
+    plane: NormalPlane
     seen: Survey
     sampling: Sampling
     spread: Spread | None
@@ -255,9 +256,7 @@ class Imager:
         """
         ways = [group[0] for group in _alike(lines)]
         system = ways[0].system
-        if system.source.rays is not None:
-            raise NoWaveImage("a ray file contains no phase, so that it has no wave image")
-        plane, upright = receiver.plane(system.axis), receiver.across(system.axis)
+        plane, upright = receiver.plane(), receiver.across
         distance = distance_of(system, parameters, plane)
         alike = [Optics(k.system, central_mode(system), parameters, k.length, k.label, plane, distance) for k in ways]
         outer = outermost_modes(system)

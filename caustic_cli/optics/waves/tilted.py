@@ -19,9 +19,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.receiver import NormalPlane, Receiver, dot
 from caustic_cli.optics.waves.propagation import phase_of
-from caustic_cli.optics.waves.receiver import Plane, Receiver, dot
-from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling
+from caustic_cli.optics.waves.sampling import Sampling
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.optics.waves.wavefront import Wavefront
 
 #: Tolerated shift of light between planes, in pixels; largest number of planes; sample points along each axis of a pixel.
@@ -29,7 +30,7 @@ STEP, MOST_PLANES, A_PIXEL = 0.2, 400, 4
 
 
 def power_on_tilted(
-    r: Receiver, plane: Plane, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype
+    r: Receiver, plane: NormalPlane, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype
 ) -> Tensor:
     """Power of one wavefront on a tilted screen's pixels, float64.
 

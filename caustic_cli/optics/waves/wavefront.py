@@ -31,12 +31,12 @@ from torch import Tensor
 from caustic_cli.optics.effects import Requests
 from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.interaction import Interaction, Parameters
+from caustic_cli.optics.receiver import NormalPlane, dot
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.optics.waves.interpolation import FineWavefront, extrapolated, interpolate, lagrange_weights, pupil_coverage
 from caustic_cli.optics.waves.ray_aiming import aimed_rays
-from caustic_cli.optics.waves.receiver import Plane, dot
-from caustic_cli.optics.waves.sampling import NoWaveImage
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 
 #: Points along each side of the pupil for a survey; fraction of rays outside the quantiles `mostly`.
 SURVEY, FEW = 65, 0.01
@@ -88,7 +88,7 @@ class Optics:
     parameters: Parameters
     wavelength: float
     label: float | None
-    plane: Plane
+    plane: NormalPlane
     distance: float
 
     @property
@@ -133,7 +133,7 @@ class Optics:
         return Intercepts(big_x - far * qx, big_y - far * qy, path, qx, qy, big_x, big_y, power)
 
 
-def distance_of(system: System, parameters: Parameters, plane: Plane) -> float:
+def distance_of(system: System, parameters: Parameters, plane: NormalPlane) -> float:
     """L, the distance of a plane from the centre of the last surface, mm."""
     last = system.elements[-1]
     x, y, z = last.pose.position
@@ -349,10 +349,10 @@ def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Intercepts, dict[s
     for start in range(0, len(u), CHUNK):
         m = optics.interactions(u[start : start + CHUNK], v[start : start + CHUNK])
         rays.append(optics.intercepts_of(m))
-        into = m.incoming[2]
+        into = m.hit.incoming[2]
         normal = m.element.pose.axes[2]
         out = sum(c * a for c, a in zip(m.state.full(m.state.direction), normal, strict=True))
-        found.append((m.n_in * into - m.n_out * out, *(c.expand(out.shape) for c in m.local[:2])))
+        found.append((m.n_in * into - m.n_out * out, *(c.expand(out.shape) for c in m.hit.local[:2])))
     f = Intercepts(*(torch.cat([getattr(p, name) for p in rays]) for name in Intercepts.__dataclass_fields__))
     return f, dict(zip(("sensitivity", "at_x", "at_y"), (torch.cat(c) for c in zip(*found, strict=True)), strict=True))
 
