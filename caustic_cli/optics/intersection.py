@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from importlib import import_module
 
 import torch
 from torch import Tensor
@@ -56,6 +57,18 @@ class Method:
 
     def __post_init__(self):
         checks.choice("intersection method", self.name, METHODS)
+
+    def start(self, field, heights: Tensor, origin, direction, radius: float | None):
+        """Distances to the intersections with the mesh (None if not requested), and (t, status) if the mesh is the whole method."""
+        if self.name == "newton":
+            return None, None
+        mesh = import_module("caustic_cli.optics.mesh").TriangleMesh(field, heights, *self.parts)  # its search is compiled
+        rays = torch.broadcast_tensors(*(torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)))
+        start, missed, _ = mesh.intersect(*rays, self.recursive)
+        if self.name == "mesh":
+            t = torch.where(missed == 0, start, torch.zeros_like(start))
+            return start, (t, within(missed.long(), start, origin, direction, radius))
+        return start, None
 
 
 def intersect_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:

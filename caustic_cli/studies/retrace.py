@@ -15,7 +15,7 @@ from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SOBOL_RAYS, stream
-from caustic_cli.optics.surfaces.cut import CutSurface
+from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
@@ -151,7 +151,7 @@ def mean_of(parts: list[Image]) -> Image:
 
 def retrace(
     scene: Scene,
-    field: HeightField | CutSurface,
+    field: HeightField | MeasuredSurface,
     heights: Tensor,
     target: np.ndarray | None,
     *,
