@@ -19,7 +19,9 @@ from caustic_cli.optics.gradient import (
     Axial,
     FishEye,
     Luneburg,
+    NextSurface,
     Radial,
+    RayFlow,
     Selfoc,
     SplineIndex,
     flow,
@@ -110,7 +112,7 @@ def test_maxwells_fish_eye_images_every_point():
     def seen(points, vectors):
         return (points[0], points[1], points[2] - 6.0), vectors
 
-    found = transfer(flow, field, None, (zero, zero, zero), d, Plane(), None, seen, 1.0)
+    found = transfer(RayFlow(flow, field, None), (zero, zero, zero), d, NextSurface(Plane(), None, seen, 1.0))
     assert bool(found.found.all()) and found.steps > 4
     assert max(float(c.abs().max()) for c in found.point[:2]) < 3e-6  # 1e-7 of ways of up to 15 mm
     assert (found.path / (0.5 * math.pi * 2.0 * 3.0) - 1.0).abs().max() < 1e-6

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -107,6 +108,7 @@ class Receiver:
         on_it.lose("off_screen", (rays.power - weight).detach())
         return on_it, arrives
 
+    @cached_property
     def plane(self) -> NormalPlane:
         """The plane through its centre normal to the axis; its own plane if that is normal to the axis."""
         (u, _, n), axis = self.axes, self.axis
@@ -133,7 +135,7 @@ class Receiver:
                 found.append((sx, sy, sz))
         return found
 
-    def extent(self, plane: NormalPlane) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Limits of its orthogonal projection onto a plane: lower and upper X and Y, mm."""
-        x, y = ([dot(c, e) for c in self.corners()] for e in plane.axes[:2])
+    def extent(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Limits of its orthogonal projection onto `plane`: lower and upper X and Y, mm."""
+        x, y = ([dot(c, e) for c in self.corners()] for e in self.plane.axes[:2])
         return (min(x), min(y)), (max(x), max(y))

@@ -365,7 +365,7 @@ def expose(
     screen, filter = screen or scene.screen, filter or Filter()
     heights = heights.detach().to(sampler.device, torch.float64)
     check_clearance(scene, heights, screen)
-    shape = (3, *screen.resolution) if scene.colored else screen.resolution
+    shape = (*scene.light.planes, *screen.resolution)
 
     def traced_by(size: int) -> Image[float]:
         parts = tracers(scene, field, sampler, dtype, size, requests)

@@ -29,6 +29,7 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Scene
+from caustic_cli.scene.features import FREE_ENTRANCE, GRADIENT, features_of
 from caustic_cli.studies.measurement import Reference
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study, plain_ticks
@@ -90,7 +91,7 @@ def run_diffraction(
     Raises:
         InputError: the index varies, or the entrance is free-form.
     """
-    if scene.lens.gradient is not None or scene.two_sided:
+    if features_of(scene, (GRADIENT, FREE_ENTRANCE)):
         raise InputError("⟨study⟩ diffraction is of lenses of one index with a flat entrance")
     plane = replace(scene, source=PlaneWave(scene.source.power), light=Light())
     own = plane.lens.size[0]

@@ -31,14 +31,15 @@ class SecondaryIntersection(Effect):
             return Decision(
                 self.name, False, "it is implemented at the last surface only, and other elements follow", present=False
             )
-        if b.slope_ratio < 1.0:
-            why = f"slopes up to {b.slope:.3g} are {b.slope_ratio:.3g} of those at which a ray that left could meet it again"
-            return Decision(self.name, False, why, b.slope_ratio, 1.0)
+        slope, ratio = b.exit.slope, b.exit.slope_ratio
+        if ratio < 1.0:
+            why = f"slopes up to {slope:.3g} are {ratio:.3g} of those at which a ray that left could meet it again"
+            return Decision(self.name, False, why, ratio, 1.0)
         return Decision(
             self.name,
             True,
-            f"slopes up to {b.slope:.3g} may intersect a ray that has left",
-            b.slope_ratio if math.isfinite(b.slope_ratio) else None,
+            f"slopes up to {slope:.3g} may intersect a ray that has left",
+            ratio if math.isfinite(ratio) else None,
             1.0,
         )
 

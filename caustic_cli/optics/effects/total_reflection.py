@@ -20,15 +20,16 @@ class TotalReflection(Effect):
         """By the bound of n sin i."""
         if scene.lens.mirror:
             return Decision(self.name, False, "a mirror has no critical angle", present=False)
-        if b.critical < 1.0 and not scene.elements:
-            return Decision(self.name, False, f"n sin i <= {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
+        at = b.exit
+        if at.critical < 1.0 and not scene.elements:
+            return Decision(self.name, False, f"n sin i <= {at.critical:.4g} at slopes up to {at.slope:.3g}", at.critical, 1.0)
         if scene.elements:
             return Decision(self.name, True, "total reflection may occur at other lenses", fixed=True)
-        return Decision(self.name, True, f"n sin i may reach {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
+        return Decision(self.name, True, f"n sin i may reach {at.critical:.4g} at slopes up to {at.slope:.3g}", at.critical, 1.0)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
         """A request to omit it, where it may occur."""
-        return NO_REQUESTS if on or bounds.critical < 1.0 else Requests.to(without=(self.name,))
+        return NO_REQUESTS if on or bounds.exit.critical < 1.0 else Requests.to(without=(self.name,))
 
     def action(self, system, requests: Requests) -> Action | None:
         """The action that transmits the light instead, on request."""

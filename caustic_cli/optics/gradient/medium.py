@@ -15,7 +15,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.frames import rotate_to_global, to_global, to_local
 from caustic_cli.optics.gradient.fields import IndexField, index_field_of
-from caustic_cli.optics.gradient.transfer import index_at, transfer
+from caustic_cli.optics.gradient.transfer import NextSurface, RayFlow, transfer
 from caustic_cli.optics.media import Medium
 from caustic_cli.optics.rays import Hit, RayState
 from caustic_cli.optics.system import Element
@@ -75,18 +75,8 @@ class GradientMedium(Medium):
         steps, before = tracer.steps.get(way, (None, given))
         if not all(a is b or (a is not None and b is not None and torch.equal(a, b)) for a, b in zip(given, before, strict=True)):
             steps = None  # the number for other parameters may be too small
-        found = transfer(
-            tracer.backend.flow,
-            self.gradient,
-            parameters.get(name),
-            point,
-            direction,
-            element.surface,
-            heights,
-            seen,
-            m.side,
-            steps,
-        )
+        rays = RayFlow(tracer.backend.flow, self.gradient, parameters.get(name))
+        found = transfer(rays, point, direction, NextSurface(element.surface, heights, seen, m.side), steps)
         if steps is None:
             tracer.steps[way] = found.steps, [None if c is None else c.clone() for c in given]
         local, incoming = seen(found.point, found.direction)
@@ -104,7 +94,9 @@ class GradientMedium(Medium):
         state, owner = m.state, tracer.owner(m.beyond)
         point = to_local(owner.pose, tuple(c.double() for c in state.full(state.origin)), (0.0, 0.0, 1.0), state.datum)[0]
         m.hit.incoming = state.full(m.hit.incoming)
-        m.n_out = self._scale(state) * index_at(tracer.backend.flow, self.gradient, parameters.get(index_name(owner)), point)
+        m.n_out = self._scale(state) * RayFlow(tracer.backend.flow, self.gradient, parameters.get(index_name(owner))).index_at(
+            point
+        )
 
     def _scale(self, rays: RayState) -> float:
         """Factor of the index at the rays' wavelength."""

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.system import PlacedScreen, System
-from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene import Scene, Screen, features
+from caustic_cli.scene.features import FEATURES
 
 #: Least cosine between a screen's normal and the axis: near grazing incidence off-axis light is parallel to the screen.
 LEAST_COSINE = 0.08
@@ -36,9 +37,9 @@ class Limit:
 
 
 RAY_FILE = Limit(lambda s: s.source.rays is not None, "a ray file contains no phase", ", so that it has no wave image")
-CURVED = Limit(lambda s: s.screen.curved, "a curved screen has no wave image", ": the field is taken on planes")
-GRADIENT = Limit(lambda s: s.lens.gradient is not None, "wave images are implemented for homogeneous lenses only", fixed=True)
-ELEMENTS = Limit(lambda s: bool(s.elements), "wave images are implemented for a single lens only", fixed=True)
+CURVED = Limit(FEATURES[features.CURVED], "a curved screen has no wave image", ": the field is taken on planes")
+GRADIENT = Limit(FEATURES[features.GRADIENT], "wave images are implemented for homogeneous lenses only", fixed=True)
+ELEMENTS = Limit(FEATURES[features.ELEMENTS], "wave images are implemented for a single lens only", fixed=True)
 LIMITS = (RAY_FILE, CURVED, GRADIENT, ELEMENTS)
 
 
