@@ -128,6 +128,17 @@ def within(status: Tensor, t: Tensor, origin, direction, radius: float | None) -
     return torch.where(beyond & (status == Status.HIT), int(Status.MISSED), status)
 
 
+def _above_aperture(origin, direction, half_size: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """The interval of t in which rays are above an aperture, from 0 on; empty as (inf, ...)."""
+    enter, leave = torch.zeros_like(direction[0]), torch.full_like(direction[0], torch.inf)
+    for o, d, r in zip(origin, direction, half_size, strict=True):
+        near = torch.where(d == 0, torch.where(o.abs() <= r, -torch.inf, torch.inf), (torch.where(d > 0, -r, r) - o) / d)
+        far = torch.where(d == 0, torch.inf, (torch.where(d > 0, r, -r) - o) / d)
+        near = torch.where(o.abs() <= r, torch.full_like(near, -torch.inf), near)
+        enter, leave = torch.maximum(enter, near), torch.minimum(leave, far)
+    return enter, leave
+
+
 @torch.no_grad()
 def reference(
     surface: Surface, heights: Tensor | None, origin, direction, side: float = 1.0, radius: float | None = None
@@ -141,12 +152,7 @@ def reference(
     rx, ry = surface.half_size
     ahead = dz > 0
     dz = torch.where(ahead, dz, torch.ones_like(dz))
-    enter, leave = torch.zeros_like(dz), torch.full_like(dz, torch.inf)
-    for o, d, r in ((ox, dx, rx), (oy, dy, ry)):  # the interval in which the ray is above the aperture
-        near = torch.where(d == 0, torch.where(o.abs() <= r, -torch.inf, torch.inf), (torch.where(d > 0, -r, r) - o) / d)
-        far = torch.where(d == 0, torch.inf, (torch.where(d > 0, r, -r) - o) / d)
-        near = torch.where(o.abs() <= r, torch.full_like(near, -torch.inf), near)
-        enter, leave = torch.maximum(enter, near), torch.minimum(leave, far)
+    enter, leave = _above_aperture((ox, oy), (dx, dy), surface.half_size)
     low, top = torch.maximum((low_z - oz) / dz, enter), (high_z - oz) / dz
     high, closed = torch.minimum(leave, top), top < leave
     possible = ahead & (low <= high) & torch.isfinite(low)

@@ -11,8 +11,8 @@ from typing import TypeGuard
 from caustic_cli.optics.backends import Fused
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.system import PlacedScreen
-from caustic_cli.scene import Screen
+from caustic_cli.optics.system import Element, PlacedScreen
+from caustic_cli.scene import Pupil, Screen
 
 
 def lowered(tracer, before: Fused | None) -> Fused | None:
@@ -21,30 +21,30 @@ def lowered(tracer, before: Fused | None) -> Fused | None:
     system, start, (inside, outside) = tracer.system, tracer.start, tracer.media[-2:]
     element, pupil = system.elements[-1], system.pupil
     surface = element.surface
-    plain = (
-        tracer.first == len(system.elements) - 1
-        and not (tracer.requests.stages or tracer.actions or tracer.track)
-        and not any(medium.varies for medium in tracer.media)
-        and start.polarised is None
-        and isinstance(surface, HeightField)
-        and not element.reflects
-        and element.pose == Pose()
-        and tracer.sides[-1] > 0
-        and element.aperture.half_size == surface.half_size
-        and isinstance(start.origin[2], float)
-        and pupil.half_size == surface.half_size
-        and (system.lit is not None or tracer.first > 0)
-    )
-    if not plain:
+    asked = tracer.requests.stages or tracer.actions or tracer.track or any(medium.varies for medium in tracer.media)
+    if asked or tracer.first != len(system.elements) - 1 or not _is_plain(element, pupil):
+        return None
+    if start.polarised is not None or not isinstance(start.origin[2], float) or not (system.lit or tracer.first):
         return None
     eta = inside.index_at(start.wavelength) / outside.index_at(start.wavelength)
     if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface
         return None
-    if start.along_axis and element.aperture.round != pupil.round:
+    if tracer.sides[-1] < 0 or (start.along_axis and element.aperture.round != pupil.round):
         return None
     if start.along_axis:
         return tracer.backend.plane_image(surface, start, eta, element.fresnel, before)
     return tracer.backend.ray_image(surface, start, eta, element.fresnel, element.aperture.radius, before)
+
+
+def _is_plain(element: Element, pupil: Pupil) -> bool:
+    """Whether an element is a refracting B-spline over the pupil, upright at the origin."""
+    surface = element.surface
+    return (
+        isinstance(surface, HeightField)
+        and not element.reflects
+        and element.pose == Pose()
+        and element.aperture.half_size == surface.half_size == pupil.half_size
+    )
 
 
 def covers(screen: Screen | PlacedScreen) -> TypeGuard[Screen]:

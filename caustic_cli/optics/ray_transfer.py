@@ -40,13 +40,10 @@ def meet(tracer, m, heights: Tensor | None) -> None:
         state, hit = state.to(tracer.dtype), SurfaceIntersection(t, gx, gy, hit.found)
         o, d = (tuple(_cast(c, tracer.dtype) for c in v) for v in (o, d))
     m.hit = Hit(advance(o, d, hit.t), d, (hit.gx, hit.gy), hit.t)
-    aperture, pupil = element.aperture, system.pupil
-    within = (aperture.half_size, aperture.round) == (pupil.half_size, pupil.round)
-    if prepared is None or state.sample is None or not within:  # a sample of the same aperture lies on the surface
-        found = hit.found
-        if aperture.round or aperture.half_size != element.surface.half_size:
-            found = found & aperture.contains(*m.hit.local[:2])
-        tracer.keep(state, found)
+    if (
+        prepared is None or state.sample is None or not _is_pupil(element, system)
+    ):  # a sample of the same aperture lies on the surface
+        tracer.keep(state, _passed(element, m.hit, hit.found))
     state.origin = to_global(element.pose, m.hit.local, state.datum)
     state.path = state.path + m.n_in * hit.t
     m.state = state
@@ -57,12 +54,21 @@ def _at_pupil(system, m) -> bool:
     e, pupil, z = m.element, system.pupil, m.state.origin[2]
     if m.index or not m.forward or not isinstance(z, float) or z + m.state.datum != pupil.z:
         return False
-    return (
-        e.surface.flat
-        and e.pose.upright
-        and e.pose.position == (0.0, 0.0, pupil.z)
-        and (e.aperture.half_size, e.aperture.round) == (pupil.half_size, pupil.round)
-    )
+    return e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z) and _is_pupil(e, system)
+
+
+def _is_pupil(element, system) -> bool:
+    """Whether an element's aperture is that of the pupil."""
+    aperture, pupil = element.aperture, system.pupil
+    return (aperture.half_size, aperture.round) == (pupil.half_size, pupil.round)
+
+
+def _passed(element, hit: Hit, found: Tensor) -> Tensor:
+    """Which of the rays `found` to meet an element's surface are within its aperture."""
+    aperture = element.aperture
+    if aperture.round or aperture.half_size != element.surface.half_size:
+        found = found & aperture.contains(*hit.local[:2])
+    return found
 
 
 def _moved_before_surface(tracer, o, d, state: RayState, element, heights) -> tuple[tuple, RayState]:

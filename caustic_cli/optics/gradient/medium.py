@@ -94,9 +94,8 @@ class GradientMedium(Medium):
         state, owner = m.state, tracer.owner(m.beyond)
         point = to_local(owner.pose, tuple(c.double() for c in state.full(state.origin)), (0.0, 0.0, 1.0), state.datum)[0]
         m.hit.incoming = state.full(m.hit.incoming)
-        m.n_out = self._scale(state) * RayFlow(tracer.backend.flow, self.gradient, parameters.get(index_name(owner))).index_at(
-            point
-        )
+        rays = RayFlow(tracer.backend.flow, self.gradient, parameters.get(index_name(owner)))
+        m.n_out = self._scale(state) * rays.index_at(point)
 
     def _scale(self, rays: RayState) -> float:
         """Factor of the index at the rays' wavelength."""
