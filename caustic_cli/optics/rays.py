@@ -28,7 +28,7 @@ LOSSES = ("missed_lens", "missed_surface", "total_internal_reflection", "fresnel
 Vector = tuple
 
 
-class Status(IntEnum):
+class RayStatus(IntEnum):
     """Outcome of a ray in front of the screen."""
 
     OK = 0
@@ -41,7 +41,7 @@ class Status(IntEnum):
 class RayState:
     """Rays at one stage of a trace.
 
-    origin, direction, power, path, polarised (E): see the module; status: (N,) int64, a `Status` each, None while all are OK; lost:
+    origin, direction, power, path, polarised (E): see the module; status: (N,) int64, a `RayStatus` each, None while all are OK; lost:
     power lost so far, by name, see LOSSES; wavelength: nm, None if no medium needs it; sample: points of the aperture through which
     the rays of a plane wave pass while they are still parallel to the axis; datum: mm; leaving: power behind the last element, for
     rays on a screen.
@@ -81,13 +81,13 @@ class RayState:
         """Add an amount of power to the account of losses under `name`."""
         self.lost[name] = self.lost.get(name, 0.0) + amount
 
-    def mark(self, where: Tensor, status: Status) -> None:
+    def mark(self, where: Tensor, status: RayStatus) -> None:
         """Set the status of the rays `where` that are still OK."""
         before = torch.zeros(where.shape, dtype=torch.int64, device=where.device) if self.status is None else self.status
-        self.status = torch.where(where & (before == Status.OK), int(status), before)
+        self.status = torch.where(where & (before == RayStatus.OK), int(status), before)
 
     def statuses(self) -> Tensor:
-        """A `Status` for every ray, (N,) int64."""
+        """A `RayStatus` for every ray, (N,) int64."""
         if self.status is None:
             return torch.zeros(self.power.shape, dtype=torch.int64, device=self.power.device)
         return self.status

@@ -40,7 +40,7 @@ from caustic_cli.optics.interface import OutgoingRays, interact
 from caustic_cli.optics.lowering import covers, lowered
 from caustic_cli.optics.memory import with_smaller_chunks
 from caustic_cli.optics.ray_transfer import prepared_intersection
-from caustic_cli.optics.rays import LOSSES, RayState, Status
+from caustic_cli.optics.rays import LOSSES, RayState, RayStatus
 from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
@@ -174,7 +174,7 @@ class Tracer:
     def _land(self, state: RayState, receiver: Receiver) -> RayState:
         ray, arrives = receiver.land(self.backend, state)
         if self.track:
-            ray.mark(~arrives, Status.AWAY_FROM_SCREEN)
+            ray.mark(~arrives, RayStatus.AWAY_FROM_SCREEN)
         return ray
 
     def expose(self, parameters: Parameters, screen: Screen | PlacedScreen, filter: Filter) -> Image[Tensor]:
@@ -253,7 +253,7 @@ class Tracer:
         kept = torch.where(found, state.power, torch.zeros_like(state.power))
         state.lose("missed_surface", (state.power - kept).detach())
         if self.track:
-            state.mark(~found, Status.MISSED_SURFACE)
+            state.mark(~found, RayStatus.MISSED_SURFACE)
         state.power = kept
 
     def _interact(self, m: Interaction) -> OutgoingRays:
@@ -285,7 +285,7 @@ class Tracer:
                     state.lose("fresnel", gone - totally)
                     state.lose("total_internal_reflection", totally)
             if self.track:
-                state.mark(~found.passes & (power_in > 0), Status.TOTAL_INTERNAL_REFLECTION)
+                state.mark(~found.passes & (power_in > 0), RayStatus.TOTAL_INTERNAL_REFLECTION)
         if any(isinstance(c, Tensor) for c in state.direction) or state.direction != (0.0, 0.0, 1.0):
             state.sample = None
         return found
