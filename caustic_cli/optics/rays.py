@@ -39,24 +39,24 @@ class RayStatus(IntEnum):
 
 @dataclass
 class RayState:
-    """Rays at one stage of a trace.
-
-    origin, direction, power, path, polarised (E): see the module; status: (N,) int64, a `RayStatus` each, None while all are OK; lost:
-    power lost so far, by name, see LOSSES; wavelength: nm, None if no medium needs it; sample: points of the aperture through which
-    the rays of a plane wave pass while they are still parallel to the axis; datum: mm; leaving: power behind the last element, for
-    rays on a screen.
-    """
+    """Rays at one stage of a trace; see the module."""
 
     origin: Vector
     direction: Vector
     power: Tensor
     path: Tensor | float = 0.0
+    #: E.
     polarised: Vector | None = None
+    #: (N,) int64, a `RayStatus` each; None while all are OK.
     status: Tensor | None = None
+    #: Power lost so far, by name, see LOSSES.
     lost: dict[str, Tensor | float] = field(default_factory=dict)
+    #: nm; None if no medium needs it.
     wavelength: float | None = None
+    #: Points of the aperture through which the rays of a plane wave pass while they are still parallel to the axis.
     sample: Sample | None = None
     datum: float = 0.0
+    #: Power behind the last element, for rays on a screen.
     leaving: Tensor | None = None
 
     @property

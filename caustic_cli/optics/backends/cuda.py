@@ -77,13 +77,11 @@ class Cuda(Torch):
         """As the reference."""
         return splat_rays(x, y, weight, screen, filter)
 
-    def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like: CudaPlaneImage | None) -> CudaPlaneImage:
+    def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like) -> CudaPlaneImage:
         """The fused kernel for rays of a plane wave on a B-spline: a function of heights, screen and filter."""
         return CudaPlaneImage(field, rays, eta, fresnel)
 
-    def ray_image(
-        self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: CudaRayImage | None
-    ) -> CudaRayImage:
+    def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like) -> CudaRayImage:
         """The fused kernel for arbitrary rays below a B-spline."""
         return CudaRayImage(field, rays, eta, fresnel, radius)
 
