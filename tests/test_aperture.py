@@ -22,7 +22,7 @@ from caustic_cli.export.mitsuba import companions, write_mitsuba
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.rays import Status
+from caustic_cli.optics.rays import RayStatus
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
@@ -72,7 +72,7 @@ def test_no_light_beyond_the_circle_and_the_energy_balance_closes(source, kernel
         else:
             (x, y, _), power = rays.origin, rays.power
             (hits,) = Tracer(System.of(scene, field), rays, track=True).land({EXIT: heights}, scene.screen)
-            beyond = hits.statuses() == Status.MISSED_SURFACE
+            beyond = hits.statuses() == RayStatus.MISSED_SURFACE
             assert not float(hits.power[beyond].abs().sum()) > 0
         fluxes += float(power.sum())
         assert not float(power[x * x + y * y > 16.0].sum()) > 0

@@ -35,7 +35,8 @@ from caustic_cli.optics.screen_shape import areas, normals, points_in_space, rea
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer, expose, is_lowered, tracers
-from caustic_cli.optics.waves import NoWaveImage, wave_image
+from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.screen import Sags
 from caustic_cli.studies.irradiance import irradiance, irradiance_figures

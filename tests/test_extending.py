@@ -246,7 +246,7 @@ SURFACE = Addition(
             "from caustic_cli.optics.surfaces.plane import Plane\n",
             "from caustic_cli.optics.surfaces.paraboloid import Paraboloid\nfrom caustic_cli.optics.surfaces.plane import Plane\n",
         ),
-        ("optics/surfaces/__init__.py", '"Nurbs", "Plane"', '"Nurbs", "Paraboloid", "Plane"'),
+        ("optics/surfaces/__init__.py", '"HeightField", "Plane"', '"HeightField", "Paraboloid", "Plane"'),
     ),
     used="""
     import torch

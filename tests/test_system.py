@@ -17,11 +17,13 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.effects import EFFECTS, Requests
 from caustic_cli.optics.frames import Pose
+from caustic_cli.optics.media import Medium
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.surfaces import HeightField, Nurbs, Plane, Sphere
-from caustic_cli.optics.system import Element, Medium, PlacedScreen, System
+from caustic_cli.optics.surfaces import HeightField, Plane, Sphere
+from caustic_cli.optics.surfaces.nurbs import Nurbs
+from caustic_cli.optics.system import Element, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer, render, trace
 from caustic_cli.scene import Aperture, Light, PlaneWave, Points, Screen
 

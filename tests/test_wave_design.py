@@ -22,7 +22,8 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_magnification, white
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.waves import NoWaveImage, wave_image
+from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import diffraction
 from caustic_cli.studies.metrics import relative_rms

@@ -43,7 +43,7 @@ from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, split_heights
-from caustic_cli.optics.waves import NoWaveImage
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
 

@@ -201,10 +201,9 @@ def landing_points(
                 state = errors.directed(scene, band.scene.source, state)
                 tracer = Tracer(system, state, torch.float64, requests)
                 forward = math.copysign(1.0, sum(a * b for a, b in zip(system.axis, axes[2], strict=True)))
-                land = tracer.backend.land if shape is None else shape.land
                 for out in tracer(parameters):
                     middle = (point[0], point[1], point[2] - out.datum)
-                    x, y, there = land(out.origin, out.direction, middle, axes, forward)
+                    x, y, there = shape.land(tracer.backend, out.origin, out.direction, middle, axes, forward)
                     power = torch.where(there, out.power, torch.zeros_like(out.power)) * scale
                     yield LandingPoints(x.double(), y.double(), power.double(), band.channel)
 

@@ -32,8 +32,6 @@ from caustic_cli.scene import Component, Scene, Screen
 RAYS, PATHS = 8_192, 4_096
 #: A body that only touches a path, or the ends of one, to this relative accuracy does not obstruct it.
 TOUCH = 1e-9
-#: Flat pieces of a curved screen along each axis.
-PIECES = 16
 #: Steps of the search for a shift of the screen: doublings from a hundredth of its size, then bisections, to a hundredth; and the
 #: factor by which a shift along x must be shorter than one along y.
 DOUBLINGS, BISECTIONS, SHORTER = 16, 7, 0.95
@@ -92,7 +90,7 @@ class ScreenBody:
     @property
     def pieces(self) -> list[Body]:
         """Its pieces."""
-        (hx, hy), k = self.screen.half_size, PIECES if self.screen.curved else 1
+        (hx, hy), k = self.screen.half_size, shape_of(self.screen).pieces
         x, y = (np.linspace(-h, h, k + 1) for h in (hx, hy))
         p = self._at(x[:, None], y[None, :])
         found = []
@@ -117,9 +115,8 @@ class ScreenBody:
 
     def _at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Points in space, (..., 3) mm, from its own coordinates, measured from its centre."""
-        shape, (sx, sy) = shape_of(self.screen), self.screen.shift
-        x, y = np.broadcast_arrays(x, y)
-        s = np.zeros_like(x) if shape is None else shape.at(x, y)[0]
+        (sx, sy), (x, y) = self.screen.shift, np.broadcast_arrays(x, y)
+        s = shape_of(self.screen).at(x, y)[0]
         axes = Pose(tilt=self.screen.tilt, frame=self.leg.frame).axes
         return np.array(self.leg.at(sx, sy, self.screen.z)) + np.stack([x, y, s], -1) @ np.array(axes)
 

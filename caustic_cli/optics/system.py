@@ -22,45 +22,15 @@ from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import AxisSegment, Pose
-from caustic_cli.optics.gradient.fields import IndexField, index_field_of
+from caustic_cli.optics.media import AIR, Medium, medium_of
 from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Sphere, Surface
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Aperture, Component, FreeForm, Lens, Light, Pupil, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES, surface_name
-from caustic_cli.scene.materials import refractive_index
 
 INTERACTIONS = ("refract", "reflect")
 #: Names of the elements of a one-lens scene.
 ENTRANCE, EXIT = "entrance", "exit"
-
-
-@dataclass(frozen=True)
-class Medium:
-    """A transparent medium.
-
-    Args:
-        index: refractive index; for a glass, that of rays without a wavelength.
-        absorption: absorption coefficient a, 1/mm; the transmittance of t mm is exp(-a t) (Beer-Lambert).
-        glass: a dispersive material, by its name in `materials`; None for `index` at every wavelength.
-        gradient: gradient-index field, in the frame of the element in front of the medium, scaled by the ratio of the glass' index
-            at a wavelength to `index`; None for a homogeneous medium.
-    """
-
-    index: float = 1.0
-    absorption: float = 0.0
-    glass: str | None = None
-    gradient: IndexField | None = None
-
-    def __post_init__(self):
-        checks.number("index", self.index, 1.0, 5.0)
-        checks.number("absorption", self.absorption, 0.0, 1e6)
-
-    def index_at(self, wavelength: float | None) -> float:
-        """Refractive index at a wavelength, nm."""
-        return self.index if self.glass is None or wavelength is None else refractive_index(self.glass, wavelength)
-
-
-AIR = Medium()
 
 
 @dataclass(frozen=True)
@@ -93,6 +63,11 @@ class Element:
     def reflects(self) -> bool:
         """Whether it is a mirror."""
         return self.interaction == "reflect"
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """Names of the effects on rays that it causes beside refraction or reflection."""
+        return frozenset({"roughness"} if self.roughness else ())
 
 
 def entrance_of(lens: Lens) -> Fixed:
@@ -194,8 +169,7 @@ class System:
     leg: AxisSegment | None = None
 
     def __post_init__(self):
-        if self.before.gradient is not None:
-            raise InputError("the medium in front of a system cannot have a gradient: no element defines its frame; add one")
+        self.before.check_first()
         if not self.elements or not self.sources:
             raise InputError("a system needs at least one source and one element")
         names = [e.name for e in self.elements]
@@ -224,7 +198,7 @@ class System:
                     ENTRANCE,
                     entrance,
                     aperture,
-                    behind=Medium(lens.index, lens.absorption, lens.glass, index_field_of(lens)),
+                    behind=medium_of(lens),
                     pose=Pose((0.0, 0.0, lens.z_in)),
                     fresnel=lens.fresnel,
                 ),
@@ -259,6 +233,12 @@ class System:
     def free(self) -> dict[str, tuple[int, int]]:
         """Shapes of the heights of all free-form surfaces, by name."""
         return {e.name: e.surface.shape for e in self.elements if e.surface.shape is not None}
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """Names of the effects on rays (`optics.effects`) that its parts cause."""
+        parts: tuple[Medium | Element | Light, ...] = (*self.media(), *self.elements, self.light)
+        return frozenset[str]().union(*(part.effects for part in parts))
 
     def media(self) -> tuple[Medium, ...]:
         """The medium in front of each element, and behind the last."""

@@ -197,7 +197,7 @@ class Scene:
                 return (Band(self),)
             return tuple(Band(replace(self, light=Light(state)), 1.0 / len(states)) for state in states)
         bands = []
-        for k, (wavelength, part) in enumerate(zip(self.light.wavelengths, self.light.parts, strict=True)):
+        for wavelength, part, channel in zip(self.light.wavelengths, self.light.parts, self.light.channels, strict=True):
             scene = self.at(wavelength) if self.dispersive else self
-            bands += [Band(replace(scene, light=Light(state)), part / len(states), k if self.colored else None) for state in states]
+            bands += [Band(replace(scene, light=Light(state)), part / len(states), channel) for state in states]
         return tuple(bands)

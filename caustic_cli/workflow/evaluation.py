@@ -22,7 +22,7 @@ from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights, trace_arguments
-from caustic_cli.optics.waves import WaveImage
+from caustic_cli.optics.waves.image import WaveImage
 from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.design_report import write_report

@@ -14,11 +14,11 @@ from scipy.special import j1
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import Pose
+from caustic_cli.optics.media import Medium
 from caustic_cli.optics.surfaces import HeightField, Plane, Sphere
-from caustic_cli.optics.system import Element, Medium, System
-from caustic_cli.optics.waves import image_of, lines_of, lines_of_system, wave_image
-from caustic_cli.optics.waves.image import Imager
-from caustic_cli.optics.waves.receiver import receiver_of
+from caustic_cli.optics.system import Element, System
+from caustic_cli.optics.waves.image import Imager, image_of, lines_of, lines_of_system, wave_image
+from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.scene import Aperture, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 
 GREEN = 550.0

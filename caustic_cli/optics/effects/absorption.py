@@ -38,9 +38,9 @@ class Absorption(Effect):
             return None
         return Probe(replace(scene, lens=replace(scene.lens, absorption=AMOUNT)), None, f"{AMOUNT:g} per mm")
 
-    def action(self, system, requests: Requests) -> Action | None:
-        """The action, if a medium absorbs."""
-        return AbsorptionAction() if any(medium.absorption for medium in system.media()) else None
+    def action(self, system, requests: Requests) -> Action:
+        """The attenuation."""
+        return AbsorptionAction()
 
 
 class AbsorptionAction(Action):
@@ -50,5 +50,5 @@ class AbsorptionAction(Action):
         """Attenuate by the factor exp(-a length)."""
         if m.absorption:
             before = m.state.power
-            m.state.power = before * torch.exp(-m.absorption * torch.as_tensor(m.length))  # 0.0 for rays on the pupil already
+            m.state.power = before * torch.exp(-m.absorption * torch.as_tensor(m.hit.length))  # 0.0 for rays on the pupil already
             m.state.lose("absorbed", (before - m.state.power).detach())

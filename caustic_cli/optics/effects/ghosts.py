@@ -55,9 +55,9 @@ class DoubleReflections(Action):
         found, elements = [], tracer.system.elements
         heights = [parameters.get(e.name) for e in elements]
         for j, m in enumerate(interactions):
-            if m.reflects or not bool((m.power_in > m.power_out).any()):
+            if m.reflects or not bool((m.power_in > m.out.power).any()):
                 continue
-            totally = ~m.passes
+            totally = ~m.out.passes
             for i in range(j - 1, -1, -1):
                 if elements[i].reflects:  # ghosts between elements separated by a mirror are not traced
                     break

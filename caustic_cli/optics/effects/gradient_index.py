@@ -34,7 +34,7 @@ class GradientIndex(Effect):
         least, most, steepest = field.extremes(lens.half_size, bounds.depth)
         turn = min(steepest * bounds.depth * most / least, 0.5 * math.pi)
         moved = turn * (bounds.depth / (2.0 * least) + scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
-        step = (max(most - lens.index, lens.index - least) / lens.index) * bounds.slope
+        step = (max(most - lens.index, lens.index - least) / lens.index) * bounds.exit.slope
         moved += step * (scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
         why = (
             f"the index goes from {least:.5g} to {most:.5g}, by up to {steepest:.3g} per mm, which moves light by up to"

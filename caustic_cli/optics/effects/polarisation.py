@@ -77,9 +77,9 @@ class FieldPropagation(Action):
             return
         pose = m.element.pose
         e, flip = rotate_to_local(pose, state.polarised), m.side
-        d = (m.incoming[0], m.incoming[1], flip * m.incoming[2])
+        d = (m.hit.incoming[0], m.hit.incoming[1], flip * m.hit.incoming[2])
         e = (e[0], e[1], flip * e[2])
-        gx, gy = (flip * g for g in m.slopes)
+        gx, gy = (flip * g for g in m.hit.slopes)
         normal = (-gx, -gy, 1.0)
         if m.reflects:
             norm2 = 1.0 + gx * gx + gy * gy

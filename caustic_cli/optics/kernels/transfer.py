@@ -32,18 +32,21 @@ Vector = tuple[float, float, float]
 
 
 class TargetPlane(NamedTuple):
-    """The target plane: p, a, b, n, and `forward`."""
+    """The target plane: p, a, b and n by components, and `forward`."""
 
-    point: Vector
-    across: Vector
-    up: Vector
-    normal: Vector
+    px: float
+    py: float
+    pz: float
+    ax: float
+    ay: float
+    az: float
+    bx: float
+    by: float
+    bz: float
+    nx: float
+    ny: float
+    nz: float
     forward: float
-
-    @classmethod
-    def of(cls, point, axes, forward) -> TargetPlane:
-        """From numbers of any kind, which a compiled function takes as floats alone."""
-        return cls._make([*(tuple(map(float, vector)) for vector in (point, *axes)), float(forward)])
 
 
 def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float):
@@ -59,7 +62,7 @@ def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], 
         x, y: (N,) in the plane; of rays that are not on their way to it those of their origin, and meaningless.
         on_way: (N,) bool.
     """
-    plane = TargetPlane.of(point, axes, forward)
+    plane = TargetPlane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
     return _Landing.apply(*origin, *direction, plane)
 
 
@@ -68,7 +71,7 @@ def _path(ray, start, count, plane, v):
     """k, 1 / v, and 1 or 0 for whether the ray is on its way, into a batch's scratch."""
     for i in range(6):
         load(ray[i], start, count, v[i])
-    (px, py, pz), (nx, ny, nz), forward = plane.point, plane.normal, plane.forward
+    px, py, pz, nx, ny, nz, forward = plane.px, plane.py, plane.pz, plane.nx, plane.ny, plane.nz, plane.forward
     for j in range(count):
         speed = v[DX, j] * nx + v[DY, j] * ny + v[DZ, j] * nz
         away = (px - v[OX, j]) * nx + (py - v[OY, j]) * ny + (pz - v[OZ, j]) * nz
@@ -82,7 +85,7 @@ def _path(ray, start, count, plane, v):
 @njit(inline="always", **FAST)
 def land_batch(v, start, count, ray, plane, x, y, on_way):
     """A batch of `_land`."""
-    (px, py, pz), (ax, ay, az), (bx, by, bz) = plane.point, plane.across, plane.up
+    px, py, pz, ax, ay, az, bx, by, bz, _, _, _, _ = plane
     _path(ray, start, count, plane, v)
     for j in range(count):
         k = v[K, j]
@@ -115,7 +118,7 @@ def _land(block, ray, plane, x, y, on_way, blocks):
 @njit(inline="always", **FAST)
 def pull_batch(v, start, count, ray, plane, given, out):
     """A batch of `_land_adjoint`."""
-    (ax, ay, az), (bx, by, bz), (nx, ny, nz) = plane.across, plane.up, plane.normal
+    _, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _ = plane
     _path(ray, start, count, plane, v)
     load(given[0], start, count, v[X])
     load(given[1], start, count, v[Y])
@@ -152,7 +155,7 @@ def _land_adjoint(block, ray, plane, given, out, count, blocks):
 @njit(inline="always", **FAST)
 def push_batch(v, start, count, ray, plane, along, out):
     """A batch of `_land_tangent`."""
-    (ax, ay, az), (bx, by, bz), (nx, ny, nz) = plane.across, plane.up, plane.normal
+    _, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _ = plane
     _path(ray, start, count, plane, v)
     for i in range(6):
         load(along[i], start, count, v[BY_OX + i])
