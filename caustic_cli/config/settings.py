@@ -21,7 +21,7 @@ from caustic_cli import __version__
 from caustic_cli.config.table import Setting, check, default, in_section
 from caustic_cli.errors import InputError, alternatives, near
 from caustic_cli.io.files import read_bytes
-from caustic_cli.scene import Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
+from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
 from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import PLANE, Sags
@@ -367,8 +367,7 @@ def _element(table: dict[str, Any], lens: dict[str, Any]) -> Component:
         raise InputError("[[element]] takes index or glass, not both")
     glass = table.get("glass")
     index = refractive_index(glass, value_of(lens, "lens.wavelength")) if glass else value_of(table, "element.index")
-    return Component(
-        kind,
+    return COMPONENTS[kind](
         table["z"],
         tuple(table["size"]),
         radius=tuple(table.get("radius", PLANE)),

@@ -27,7 +27,7 @@ from caustic_cli.export.surface import Sampling, sample_grid, samplings
 from caustic_cli.io.files import MARK, atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.scene import Lens, Light, Scene, Screen, Source
+from caustic_cli.scene import Aperture, Lens, Light, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 
 FORMAT_VERSION = 1
@@ -89,9 +89,7 @@ def write_lighttools(
         "resolution": np.array(scene.screen.resolution, np.int64),
         **_screen(scene.screen),
         **_source(scene),
-        **({"aperture": np.array("circle")} if scene.lens.round else {}),
-        **({"mirror": np.array(1, np.int64)} if scene.lens.mirror else {}),
-        **({} if scene.lens.fresnel == "exact" else {"fresnel": np.array(scene.lens.fresnel)}),
+        **{key: np.array(value) for key, value, usual in _unusual(scene.lens) if value != usual},
         **_glass(scene.lens),
         **_light(scene.light),
         "control_points": np.asfortranarray(np.stack([x, y, net], -1)),
@@ -148,6 +146,11 @@ def _net(heights: Tensor, rounding: bool) -> np.ndarray:
 def _multiples(values: np.ndarray, quantum: float) -> np.ndarray:
     """Values rounded to multiples of a quantum, which end in zeros that can be compressed."""
     return np.rint(values / quantum) * quantum
+
+
+def _unusual(lens: Lens) -> tuple[tuple[str, str | np.int64, str | int], ...]:
+    """Optional keys of the lens, and the values with which they are left out."""
+    return ("aperture", lens.aperture, Aperture.name), ("mirror", np.int64(lens.mirror), 0), ("fresnel", lens.fresnel, "exact")
 
 
 def _glass(lens: Lens) -> dict[str, np.ndarray]:
@@ -254,7 +257,7 @@ def _of_plane(scene: Scene) -> dict[str, np.ndarray]:
 
 def _of_points(scene: Scene) -> dict[str, np.ndarray]:
     source, lens = scene.source, scene.lens
-    return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round))), **_intensity(source)}
+    return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.pupil))), **_intensity(source)}
 
 
 def _intensity(source: Source) -> dict[str, np.ndarray]:
@@ -277,7 +280,7 @@ def _of_rays(scene: Scene) -> dict[str, np.ndarray]:
     """Keys of a ray file, which is not included: the cone about the point where its rays are closest to each other, and
     `source_rays_sha256`, by which the file is recognised."""
     source, lens = scene.source, scene.lens
-    cone = _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round)))
+    cone = _reals(np.degrees(source.cone_over(lens.pupil)))
     return {"cone_half_angle": cone, "source_rays_sha256": np.array(source.rays.digest)}
 
 

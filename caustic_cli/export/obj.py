@@ -5,12 +5,12 @@ Lengths have DECIMALS decimals: at a distance of the points of 1 um, rounding ch
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from torch import Tensor
 
 from caustic_cli.export import mesh
-from caustic_cli.export.reading import Readings
 from caustic_cli.export.surface import Sampling
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_file
@@ -38,13 +38,6 @@ def write_obj(
         file.writelines(rows(faces + 1, "f %d %d %d\n"))
 
 
-def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
-    """Densities of files of at most `limit` bytes, the smallest first."""
-    return mesh.choices(scene, field, heights, limit, A_POINT)
-
-
-def readings(
-    scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
-) -> Readings:
-    """The surface as read from the mesh, with rounded lengths."""
-    return mesh.readings(scene, field, heights, samples, tolerance, lambda points: points.round(DECIMALS))
+#: Densities of files of at most `limit` bytes, the smallest first; and the surface as read from the mesh, with rounded lengths.
+choices = partial(mesh.choices, a_point=A_POINT)
+readings = partial(mesh.readings, rounded=lambda points: points.round(DECIMALS))

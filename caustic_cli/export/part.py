@@ -62,7 +62,7 @@ def part_of(
         InputError: the format does not support moulds, or a block is given for a lens.
     """
     lens, heights = scene.lens, heights.detach().double().cpu()
-    kind = "mould" if mould else "mirror" if lens.mirror else "lens"
+    kind = "mould" if mould else lens.kind
     if lens.gradient is not None and format in ONE_INDEX:
         shapes = ", ".join(name for name in FORMATS if name not in ONE_INDEX)
         raise InputError(f"⟨format⟩ {format} holds one index, and this lens' varies; {shapes} hold its shape alone")
@@ -73,8 +73,7 @@ def part_of(
     if kind == "lens":
         return Part(scene, field, heights, kind)
     room = BLOCK * max(lens.size) if block is None else block
-    above = lens.mirror != mould
-    if not above:  # the mould of a mirror
+    if (-lens.cut_from if mould else lens.cut_from) > 0:  # the mould of a mirror, with material below its surface as a lens
         return Part(_alone(scene, float(heights.min()) - room), field, heights, kind)
     if format not in AS_CUT and not mould:
         back = float(heights.max()) + room if format in SOLIDS else lens.z_in

@@ -165,6 +165,6 @@ def local_magnification(scene: Scene, field: HeightField, heights: Tensor) -> fl
     Light from s lands at X = s (1 + L / a) + L g grad h, a the distance of the source and g = n - 1, or 2 for a mirror.
     """
     light = paraxial(scene, field, heights)
-    gain = light.throw * (2.0 if scene.lens.mirror else scene.lens.index - 1.0)
+    gain = light.throw * abs(scene.lens.effective_index - 1.0)
     xx, xy, yy = gain * light.xx, gain * light.xy, gain * light.yy
     return float(((light.straight + xx) * (light.straight + yy) - xy * xy).abs().mean().sqrt())

@@ -46,7 +46,7 @@ from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.screen_shape import reach, shape_of
 from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.optics.system import EXIT, Element, PlacedScreen, System
-from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Aperture, Light, PlaneWave, Points, Scene, Screen
 
 #: Rays per chunk, which bounds the memory.
 CHUNK = 1 << 19
@@ -272,10 +272,10 @@ class Tracer:
             o, d = (tuple(_cast(c, self.dtype) for c in v) for v in (o, d))
         m.local, m.incoming, m.slopes, m.length = advance(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
         aperture, pupil = element.aperture, self.system.pupil
-        within = (aperture.half_size, aperture.round) == (pupil.half_size, pupil.round)
-        if prepared is None or state.sample is None or not within:  # a sample of the same aperture lies on the surface
+        on_it = prepared is not None and state.sample is not None and aperture == pupil.aperture
+        if not on_it:  # a sample of the same aperture lies on the surface
             found = hit.found
-            if aperture.round or aperture.half_size != element.surface.half_size:
+            if aperture != Aperture(element.surface.half_size):
                 found = found & aperture.contains(*m.local[:2])
             kept = torch.where(found, state.power, torch.zeros_like(state.power))
             state.lose("missed_surface", (state.power - kept).detach())
@@ -387,12 +387,7 @@ class Tracer:
         e, pupil, z = m.element, self.system.pupil, m.state.origin[2]
         if m.index or not m.forward or not isinstance(z, float) or z + m.state.datum != pupil.z:
             return False
-        return (
-            e.surface.flat
-            and e.pose.upright
-            and e.pose.position == (0.0, 0.0, pupil.z)
-            and (e.aperture.half_size, e.aperture.round) == (pupil.half_size, pupil.round)
-        )
+        return e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z) and e.aperture == pupil.aperture
 
     def _moved_before_surface(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
         """Rays on a pupil that intersects the first surface, moved back in front of it."""
@@ -458,7 +453,7 @@ class Tracer:
         eta = m[-2].index_at(start.wavelength) / m[-1].index_at(start.wavelength)
         if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface
             return None
-        if start.along_axis and element.aperture.round != self.system.pupil.round:
+        if start.along_axis and element.aperture != self.system.pupil.aperture:
             return None
         before = None if like is None else like.fused
         if start.along_axis:
@@ -666,16 +661,12 @@ def check_clearance(scene: Scene, heights: Tensor, screen: Screen) -> None:
     Raises:
         InputError: giving the extreme height of the surface.
     """
-    before, behind = reach(screen)
-    nearer = behind if scene.lens.mirror else -before
+    lens, side = scene.lens, scene.lens.interaction.side
+    nearer = max(-side * bound for bound in reach(screen))
     lean = f" and its {'shape' if screen.curved else 'tilt'} takes it {nearer:.4g} mm nearer" if nearer else ""
-    if scene.lens.mirror:
-        if float(heights.min()) <= screen.z + nearer:
-            raise InputError(
-                f"⟨screen.z⟩ must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
-                f" got {screen.z:g} mm{lean}"
-            )
-    elif float(heights.max()) >= screen.z - nearer:
+    top = side * float((side * heights).max())
+    if side * (screen.z - top) <= nearer:
         raise InputError(
-            f"⟨screen.z⟩ must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm, got {screen.z:g} mm{lean}"
+            f"⟨screen.z⟩ must lie {lens.interaction.beyond} the {lens.kind}, whose surface reaches {top:.6g} mm,"
+            f" got {screen.z:g} mm{lean}"
         )

@@ -34,6 +34,7 @@ from caustic_cli.export.part import Part
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Aperture
 
 #: Tolerance of the path over the scallop height; digits of a coordinate beyond those of the tolerance; least number of digits.
 PATH_PART, MORE_DIGITS, LEAST_DIGITS = 0.01, 1, 4
@@ -122,12 +123,13 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     """
     if tolerance is not None:
         checks.number("⟨tolerance⟩", tolerance, 0.0, LENGTH, open_low=True)
-    m, lens, base = milling or Milling(), part.lens, part.lens.z_in
+    m, base = milling or Milling(), part.lens.z_in
     field, heights = part.field, part.heights - base  # from here on Z0 is the flat face
     low, high, slope, concave = shape_of(field, heights)
     step = m.step(concave, slope)
     over = min(MOST_OVER * m.tool_radius, m.tool_radius * slope / math.sqrt(1.0 + slope * slope) + step)
-    step = spacing(m.path, lens.half_size, over, step, lens.round)
+    outline = part.lens.opening.grown(over)
+    step = spacing(m.path, outline, step)
     scallop = m.scallop_of(step, concave, slope)
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
     digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance)) + MORE_DIGITS)
@@ -141,8 +143,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
             " larger tool or finer scallops keep it above"
         )
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
-    shape = (lens.half_size, over, step, lens.round)
-    passes = spiral(*shape) if m.path == "spiral" else raster(*shape, lines[m.path])
+    passes = spiral(outline, step) if m.path == "spiral" else raster(outline, step, lines[m.path])
     with atomic_file(path) as file:
         out = _Writer(file, digits)
         out.say(*_head(part, m, step, scallop, top, digits, tolerance))
@@ -150,7 +151,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
         out.say(" " * COUNTED, "G21 G90 G17 G94")
         if m.roughing is not None:
             _begin(out, m.roughing_tool, m.rough_radius, m.spindle, safe)
-            _rough(out, m, field, heights, lens, top, low, safe)
+            _rough(out, m, field, heights, part.lens.opening, top, low, safe)
             out.say("M5", "M0 (change the tool)")
         _begin(out, "ball", m.tool_radius, m.spindle, safe)
         offset, first = BallOffset(field, heights, m.tool_radius), True
@@ -224,7 +225,9 @@ def _batches(passes: Iterator[np.ndarray], move: float) -> Iterator[np.ndarray]:
         yield np.concatenate(held)
 
 
-def _rough(out: _Writer, m: Milling, field: HeightField, heights: Tensor, lens, top: float, low: float, safe: float) -> None:
+def _rough(
+    out: _Writer, m: Milling, field: HeightField, heights: Tensor, aperture: Aperture, top: float, low: float, safe: float
+) -> None:
     """Write layers from the top of the stock down to the allowance above the surface."""
     make, radius = {"ball": BallOffset, "flat": FlatOffset}[m.roughing_tool], m.rough_radius
     offset = make(field, heights, radius, m.allowance)
@@ -238,7 +241,7 @@ def _rough(out: _Writer, m: Milling, field: HeightField, heights: Tensor, lens, 
         def height(x: np.ndarray, y: np.ndarray, floor: float = floor) -> np.ndarray:
             return np.maximum(offset(x, y), floor)
 
-        for line in raster(lens.half_size, 0.5 * radius, ROUGH_STEP * radius, lens.round):
+        for line in raster(aperture.grown(0.5 * radius), ROUGH_STEP * radius):
             points = with_heights(line, height, FIRST_MOVE * radius, ROUGH_PART * m.allowance)
             kept = points[:, 2] < above  # elsewhere the material is removed already, or the surface reached
             for run in np.split(np.arange(len(points)), np.flatnonzero(np.diff(kept.astype(int))) + 1):

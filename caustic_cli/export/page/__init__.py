@@ -123,10 +123,10 @@ def write_page(
         "lens": {
             "size": list(lens.size),
             "zIn": lens.z_in,
-            "round": lens.round,
+            "round": lens.opening.round,
             "mirror": lens.mirror,
-            "fresnel": ["none", "schlick", "exact"].index("none" if lens.mirror else lens.fresnel),
-            "absorption": 0.0 if lens.mirror else lens.absorption,
+            "fresnel": ["none", "schlick", "exact"].index(lens.interior.fresnel),
+            "absorption": lens.interior.absorption,
         },
         "screen": {
             "z": screen.z,
@@ -140,11 +140,10 @@ def write_page(
         "target": None if target is None else _coded(_onto(target, screen)),
         "waves": None if waves is None else _coded(_onto(waves, screen)),
     }
-    kind = "mirror" if lens.mirror else "lens"
     words = {
         "title": html.escape(title),
-        "kind": kind,
-        "Kind": kind.capitalize(),
+        "kind": lens.kind,
+        "Kind": lens.kind.capitalize(),
         "rows": _table(rows),
         "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes),
     }
@@ -245,7 +244,7 @@ def _source(scene: Scene, source: Source) -> dict:
     if len(places) > PLACES:
         kept = np.linspace(0, len(places) - 1, PLACES).round().astype(int)
         places, parts = places[kept], parts[kept] / parts[kept].sum()
-    cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
+    cone = source.cone_over(lens.pupil)
     angles = 2.0 * np.arcsin(np.linspace(0.0, 1.0, ANGLES) * math.sin(0.5 * cone))
     return {
         "near": True,
