@@ -23,7 +23,7 @@ from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export import reading
 from caustic_cli.export.reading import Readings
-from caustic_cli.export.surface import Sampling, sample_grid, samplings
+from caustic_cli.export.surface import Sampling, control_points, sample_grid, samplings
 from caustic_cli.io.files import MARK, atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
@@ -72,8 +72,6 @@ def write_lighttools(
     if rounding:
         points[:, 2] = _multiples(points[:, 2], QUANTUM)
         normals = _multiples(normals, NORMAL_QUANTUM)
-    x, y = (c.numpy() for c in field.control_xy())
-    x, y = np.broadcast_arrays(x[:, None], y[None, :])
     arrays = {
         "points": np.asfortranarray(points),
         "normals": np.asfortranarray(normals),
@@ -92,7 +90,7 @@ def write_lighttools(
         **{key: np.array(value) for key, value, usual in _unusual(scene.lens) if value != usual},
         **_glass(scene.lens),
         **_light(scene.light),
-        "control_points": np.asfortranarray(np.stack([x, y, net], -1)),
+        "control_points": np.asfortranarray(control_points(field, net)),
         "degrees": np.array([s.degree for s in field.spaces], np.int64),
         "knots_u": field.spaces[0].knots.numpy(),
         "knots_v": field.spaces[1].knots.numpy(),
@@ -102,6 +100,11 @@ def write_lighttools(
         "format_version": np.array(FORMAT_VERSION, np.int64),
         "created_by": np.array(f"caustic {__version__}"),
     }
+    _write(path, arrays)
+
+
+def _write(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write the archive of these arrays, in their order."""
     with atomic_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
         for name, array in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy")  # dated 1980-01-01
@@ -175,11 +178,9 @@ def _entrance(scene: Scene) -> dict[str, np.ndarray]:
     if scene.lens.entrance is None:
         return {}
     front = entrance_of(scene.lens)
-    x, y = (c.numpy() for c in front.field.control_xy())
-    x, y = np.broadcast_arrays(x[:, None], y[None, :])
     u, v = front.field.spaces
     return {
-        "entrance_control_points": np.stack([x, y, front.heights.numpy() + scene.lens.z_in], -1),
+        "entrance_control_points": control_points(front.field, front.heights.numpy() + scene.lens.z_in),
         "entrance_degrees": np.array([u.degree, v.degree], np.int64),
         "entrance_knots_u": u.knots.numpy(),
         "entrance_knots_v": v.knots.numpy(),

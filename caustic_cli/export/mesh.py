@@ -99,34 +99,21 @@ def patches(
     samples: Sampling | None = None,
     tolerance: float | None = None,
 ) -> tuple[Patch, ...]:
-    """Patches of the free-form sides of a solid, the exit last; arguments as in `closed_mesh`."""
-    if lens.entrance is None:
-        return (LATTICES[lens.aperture].patch(field, heights, samples, tolerance),)
-    return both_patches(lens, field, heights, samples, tolerance)
+    """Patches of the free-form sides of a solid, the exit last, with equal numbers of points; arguments as in `closed_mesh`."""
+    patch, surfaces = LATTICES[lens.aperture].patch, [(field, heights)]
+    if lens.entrance is not None:
+        entrance = entrance_of(lens)
+        surfaces.insert(0, (entrance.field, entrance.heights + lens.z_in))
+    found = [patch(*surface, samples, tolerance) for surface in surfaces]
+    shapes = {p.points.shape[:2] for p in found}
+    if len(shapes) > 1:
+        found = [patch(*surface, (max(nx for nx, _ in shapes), max(ny for _, ny in shapes))) for surface in surfaces]
+    return tuple(found)
 
 
 def solid_of(lens: Lens, *sides: Patch) -> tuple[np.ndarray, np.ndarray]:
     """Closed mesh of a solid with these free-form sides: vertices and faces."""
     return solid(sides[0].points, lens) if len(sides) == 1 else _between(*(side.points for side in sides), lens)
-
-
-def both_patches(
-    lens: Lens,
-    field: HeightField,
-    heights: Tensor,
-    samples: Sampling | None = None,
-    tolerance: float | None = None,
-) -> tuple[Patch, Patch]:
-    """Patches of the free-form entrance and the exit of a lens, with equal numbers of points; arguments as in
-    `closed_mesh`."""
-    entrance = entrance_of(lens)
-    surfaces = (entrance.field, entrance.heights + lens.z_in), (field, heights)
-    patch = LATTICES[lens.aperture].patch
-    found = [patch(*surface, samples, tolerance) for surface in surfaces]
-    shapes = [p.points.shape[:2] for p in found]
-    if shapes[0] != shapes[1]:
-        found = [patch(*surface, (max(s[0] for s in shapes), max(s[1] for s in shapes))) for surface in surfaces]
-    return found[0], found[1]
 
 
 def _between(low: np.ndarray, high: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:

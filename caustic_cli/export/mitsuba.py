@@ -32,7 +32,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export import mesh
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.lattice import LATTICES, Patch, triangles
-from caustic_cli.export.mesh import both_patches, patches, refuse_open, rim_of, walls
+from caustic_cli.export.mesh import patches, refuse_open, rim_of, walls
 from caustic_cli.export.ply import FACE, write_mesh
 from caustic_cli.export.reading import Readings
 from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling
@@ -180,15 +180,15 @@ def _others(path: Path, scene: Scene) -> list[str]:
     it."""
     lines = []
     for body in bodies(scene):
-        patches = both_patches(body.lens, body.field, body.heights)
+        sides = patches(body.lens, body.field, body.heights)
         black = f"element-{body.number + 1}-black"
-        rims = [p.points.reshape(-1, 3)[rim_of(*p.points.shape[:2])] for p in patches]
+        rims = [p.points.reshape(-1, 3)[rim_of(*p.points.shape[:2])] for p in sides]
         outer = rims[0] * [FRAME, FRAME, 1.0]
         frame, around = _strip(outer, rims[0])
-        sides, across = _strip(rims[1], rims[0])
-        write_mesh(_beside(path, black), body.placed(np.concatenate([frame, sides])), np.concatenate([around, across + len(frame)]))
+        across, down = _strip(rims[1], rims[0])
+        write_mesh(_beside(path, black), body.placed(np.concatenate([frame, across])), np.concatenate([around, down + len(frame)]))
         coating = _COATINGS[body.component.kind](body.component.index)
-        for side, seen in zip(body.component.sides, patches, strict=False):
+        for side, seen in zip(body.component.sides, sides, strict=False):
             name = surface_name(body.number, side)
             faces, normals = triangles(seen.points), seen.normals.reshape(-1, 3)
             if side == "front":  # normals out of the glass, or towards the light

@@ -32,7 +32,7 @@ from caustic_cli.export.approximation import on_fewer_knots
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
 from caustic_cli.export.reading import Readings, of_poles
-from caustic_cli.export.surface import STEPS_PER_SPAN, decimals_for, knot_lines, on_lines
+from caustic_cli.export.surface import STEPS_PER_SPAN, control_points, decimals_for, knot_lines, on_lines
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.frames import Pose, rotate_to_global, to_global
@@ -241,12 +241,6 @@ def _bytes(field: HeightField, heights: Tensor, decimals: int) -> int:
     return len("#1234567=CARTESIAN_POINT('',(,,));\n#1234567,") + sum(len(f"{-w:.{decimals}f}") for w in widest)
 
 
-def poles_of(field: HeightField, net: np.ndarray) -> np.ndarray:
-    """Poles (n, m, 3) mm: control heights (n, m) at the Greville abscissae."""
-    x, y = (c.numpy() for c in field.control_xy())
-    return np.stack([*np.broadcast_arrays(x[:, None], y[None, :]), net], -1)
-
-
 def _spline_surface(out: Entities, field: HeightField, poles: np.ndarray) -> tuple[str, list[list[str]]]:
     """The surface with poles (n, m, 3), and its points."""
     su, sv = field.spaces
@@ -286,7 +280,7 @@ def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor) -
 
 def _trimmed(out: Entities, outline: Polygon, field: HeightField, heights: Tensor) -> tuple[str, Loop, float]:
     """A B-spline surface, its border, and the least height there, mm."""
-    surface, points = _spline_surface(out, field, poles := poles_of(field, heights.numpy()))
+    surface, points = _spline_surface(out, field, poles := control_points(field, heights.numpy()))
     return surface, *outline.rim(out, field, heights, poles, points)
 
 

@@ -13,17 +13,14 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export import mesh
-from caustic_cli.export.surface import Sampling
 from caustic_cli.io.files import atomic_file
-from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene
 
 #: Must not begin with "solid", by which readers recognise the text variant.
 HEADER = f"binary STL of a lens, millimetres, caustic {__version__}".encode().ljust(80)
@@ -32,20 +29,13 @@ TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribu
 BLOCK = 1 << 20
 
 
-def write_stl(
-    path: str | Path,
-    scene: Scene,
-    field: HeightField,
-    heights: Tensor,
-    samples: Sampling | None = None,
-    tolerance: float | None = None,
-) -> None:
+def write_stl(path: str | Path, *lens: Any, **density: Any) -> None:
     """Write the solid atomically.  Arguments as in `closed_mesh`.
 
     Raises:
         InputError: as `closed_mesh`; points that coincide in float32; or the file cannot be written.
     """
-    vertices, faces = mesh.closed_mesh(scene, field, heights, samples, tolerance)
+    vertices, faces = mesh.closed_mesh(*lens, **density)
     vertices = vertices.astype("<f4")
     with atomic_file(path) as file:
         file.write(HEADER)

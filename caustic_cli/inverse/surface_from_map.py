@@ -116,11 +116,7 @@ def surface(
     """
     began = time.perf_counter()
     shape = np.shape(source)
-    if not (index == -1.0 or 1.0 < index <= 5.0 or 0.2 <= index < 1.0):
-        raise InputError(f"index must be more than 1 and at most 5, or its inverse, got {index!r}")
-    if not (np.isfinite(z_screen) and np.isfinite(thickness) and math.copysign(1.0, index) * (z_screen - thickness) > 0):
-        where = "beyond the lens'" if index > 0 else "before the mirror's"
-        raise InputError(f"the screen at {z_screen!r} mm must lie {where} height of {thickness!r} mm")
+    _check_place(index, z_screen, thickness)
     d = _directions(directions, (shape[0] + 1, shape[1] + 1))
     half = tuple(float(h) for h in source_half)
     map_ = solve(source, target, half, target_half, **options)
@@ -143,6 +139,14 @@ def surface(
         map_ = solve(source, moved, half, reach, start=map_.potential, **{k: v for k, v in options.items() if k != "start"})
         aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
     return MappedSurface(z, *landing, miss, shift, again, map_, time.perf_counter() - began)
+
+
+def _check_place(index: float, z_screen: float, thickness: float) -> None:
+    if not (index == -1.0 or 1.0 < index <= 5.0 or 0.2 <= index < 1.0):
+        raise InputError(f"index must be more than 1 and at most 5, or its inverse, got {index!r}")
+    if not (np.isfinite(z_screen) and np.isfinite(thickness) and math.copysign(1.0, index) * (z_screen - thickness) > 0):
+        where = "beyond the lens'" if index > 0 else "before the mirror's"
+        raise InputError(f"the screen at {z_screen!r} mm must lie {where} height of {thickness!r} mm")
 
 
 def finer(

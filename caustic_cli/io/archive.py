@@ -18,21 +18,8 @@ from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.bspline import MAX_DEGREE
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import freeform_of
-from caustic_cli.scene import (
-    COMPONENTS,
-    Component,
-    Disc,
-    FreeForm,
-    Lens,
-    Light,
-    Offset,
-    PlaneWave,
-    Points,
-    Scene,
-    Screen,
-    Source,
-)
-from caustic_cli.scene.elements import SIDES
+from caustic_cli.scene import Component, Disc, FreeForm, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, Source
+from caustic_cli.scene.elements import COMPONENTS, SIDES
 from caustic_cli.scene.light import MAX_WAVELENGTHS
 from caustic_cli.scene.materials import material
 from caustic_cli.scene.screen import MAX_SAGS, Sags

@@ -8,7 +8,6 @@ from caustic_cli.scene.elements import (
     COMPONENTS,
     Component,
     FoldMirror,
-    Singlet,
     check_compatible_with_elements,
     check_positions,
     surface_name,
@@ -37,7 +36,6 @@ __all__ = [
     "Scene",
     "Screen",
     "SecondTarget",
-    "Singlet",
     "Source",
 ]
 

@@ -35,14 +35,14 @@ SIDES = ("front", "back")
 
 @dataclass(frozen=True)
 class Component:
-    """A singlet lens or a mirror; see the module.
+    """A singlet lens; see the module.
 
     Args:
         z: of its first vertex, mm.
         size: full width and height of its aperture, mm.
-        thickness: centre thickness of a lens, mm.
-        radius: radii of curvature (front, back), mm; a mirror uses the first only.
-        index: refractive index of a lens.
+        thickness: centre thickness, mm.
+        radius: radii of curvature (front, back), mm.
+        index: refractive index.
         absorption: absorption coefficient of its glass, 1/mm.
         glass: a dispersive material, by its name in `materials`; None for `index` at every wavelength.
         aperture: rectangle, or circle, the largest that fits into size.
@@ -87,8 +87,16 @@ class Component:
         self._check()
 
     def _check(self) -> None:
-        """Check what depends on the kind."""
-        raise NotImplementedError
+        for key in ("thickness", "index", "absorption"):
+            check(f"element.{key}", getattr(self, key))
+        if any(self.tilt):
+            raise InputError("⟨element.tilt⟩ is for mirrors: lenses are perpendicular to the axis")
+        rim = self.thickness + self.sag("back") - self.sag("front")
+        if rim <= 0:
+            raise InputError(
+                f"⟨element.thickness⟩ of the lens at z = {self.z:g} mm must be more than"
+                f" {at_least(self.thickness - rim, 4)} mm for glass at the rim of its aperture, got {self.thickness:g} mm"
+            )
 
     def check_place(self, lens: tuple[float, float]) -> None:
         """Check that it may stand where it does beside a lens with this z of the entrance and of the centre of the exit, mm."""
@@ -135,41 +143,6 @@ class Component:
     @property
     def extent(self) -> tuple[float, float]:
         """Range of z that it occupies, mm."""
-        raise NotImplementedError
-
-    @property
-    def thinnest(self) -> float:
-        """Least thickness of its glass without designed surfaces, mm; infinite without glass."""
-        raise NotImplementedError
-
-    def axis_behind(self, leg: Any) -> Any:
-        """The segment of the axis (`optics.frames.AxisSegment`) behind it, from that in front of it."""
-        raise NotImplementedError
-
-    def at(self, wavelength: float) -> Component:
-        """The component with its index evaluated at a wavelength, nm."""
-        return self if self.glass is None else replace(self, index=refractive_index(self.glass, wavelength))
-
-
-@dataclass(frozen=True)
-class Singlet(Component):
-    """A lens between two surfaces."""
-
-    def _check(self) -> None:
-        for key in ("thickness", "index", "absorption"):
-            check(f"element.{key}", getattr(self, key))
-        if any(self.tilt):
-            raise InputError("⟨element.tilt⟩ is for mirrors: lenses are perpendicular to the axis")
-        rim = self.thickness + self.sag("back") - self.sag("front")
-        if rim <= 0:
-            raise InputError(
-                f"⟨element.thickness⟩ of the lens at z = {self.z:g} mm must be more than"
-                f" {at_least(self.thickness - rim, 4)} mm for glass at the rim of its aperture, got {self.thickness:g} mm"
-            )
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """As of a component."""
         low, high = (
             self.sag(side) if f is None else float(f.heights.min() if side == "front" else f.heights.max())
             for side, f in zip(SIDES, self.surfaces, strict=True)
@@ -178,17 +151,21 @@ class Singlet(Component):
 
     @property
     def thinnest(self) -> float:
-        """As of a component."""
+        """Least thickness of its glass without designed surfaces, mm; infinite without glass."""
         return self.thickness + min(0.0, self.sag("back") - self.sag("front"))
 
     def axis_behind(self, leg: Any) -> Any:
-        """The same."""
+        """The segment of the axis (`optics.frames.AxisSegment`) behind it, from that in front of it."""
         return leg
+
+    def at(self, wavelength: float) -> Component:
+        """The component with its index evaluated at a wavelength, nm."""
+        return self if self.glass is None else replace(self, index=refractive_index(self.glass, wavelength))
 
 
 @dataclass(frozen=True)
 class FoldMirror(Component):
-    """A tilted mirror, which folds the axis."""
+    """A tilted mirror, which folds the axis and uses the first radius only."""
 
     interaction: ClassVar[Refracting | Reflecting] = Reflecting()
     sides: ClassVar[tuple[str, ...]] = SIDES[:1]
@@ -232,7 +209,7 @@ class FoldMirror(Component):
 
 
 #: Components by their names among the settings.
-COMPONENTS: dict[str, type[Component]] = {shape.interaction.kind: shape for shape in (Singlet, FoldMirror)}
+COMPONENTS: dict[str, type[Component]] = {shape.interaction.kind: shape for shape in (Component, FoldMirror)}
 
 
 def surface_name(number: int, side: str) -> str:

@@ -36,11 +36,11 @@ import numpy as np
 
 HERE = Path(__file__).resolve().parents[2]
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
-#: Options of the small designs, which are interrupted in the middle of their stages and resumed.
-SMALL = "--resolution 32 --control 36 --rays 6000 --quality draft --iterations 40"
+#: Options of the small designs, and their resumption.
+SMALL = "--resolution 24 --control 16 --rays 4000 --iterations 4 --quality draft"
 DESIGNS = {
     "rays": "--waves off",
-    "waves": "--waves on",
+    "waves": "--lens-size 2 --throw 60",
     "offset": "--waves off --start offset",
     "adam": "--waves off --start offset --optimizer adam --lr 1e-4",
     "sparse": "--waves off --start offset --network sparse",
@@ -54,10 +54,9 @@ DESIGNS = {
     "disc": "--waves off --source disc --source-size 2 --source-position 0,0,-500",
     "sun": "--source-angle 0.53",
     "collimate": "--waves off --collimate",
-    "second": "--waves off --second flame.png --second-at 400",
-    "array": "--waves off --array 2 --control 73",
+    "second": "--waves off --second other.png --second-at 400",
+    "array": "--waves off --array 2",
     "element": "--waves off --element 'lens z=20 thickness=4 radius=80,-80 size=14'",
-    "free": "--waves off --element 'lens z=20 thickness=4 size=14 free=back'",
     "gradient": "--waves off --gradient free",
     "over": "--waves off --start offset --network dense --control 8 --over throw=250:350",
     "robust": "--waves off --robust errors.toml",
@@ -187,7 +186,7 @@ def record_designs(recorder: Recorder) -> None:
         project = recorder.scratch / f"{name}.caustic"
         for step, command in (
             ("new", f"design flame.png {SMALL} {options} -o {name}.caustic --json --quiet"),
-            ("resumed", f"design --resume {name}.caustic --iterations 0 --json --quiet"),
+            ("resumed", f"design --resume {name}.caustic --iterations 6 --json --quiet"),
         ):
             _, out, err = recorder.run(command)
             recorder.figures(f"designs/{name}-{step}", out, err)
@@ -211,10 +210,8 @@ def record_images(recorder: Recorder) -> None:
             if (path := recorder.scratch / file).exists():
                 recorder.array(f"images/{name}-{file}", np.load(path))
                 path.unlink()
-    _, out, err = recorder.run("gradmap rays.caustic --control 17,20 --npy g.npy -o g.png --json --quiet --force")
-    recorder.figures("images/gradmap", out, err)
-    if (path := recorder.scratch / "g.npy").exists():
-        recorder.array("images/gradmap.npy", np.load(path))
+    recorder.run("gradmap rays.caustic --control 7,8 --npy g.npy -o g.png --quiet --force")
+    recorder.array("images/gradmap.npy", np.load(recorder.scratch / "g.npy"))
 
 
 def record_refusals(recorder: Recorder) -> None:

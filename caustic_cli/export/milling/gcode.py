@@ -133,9 +133,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     scallop = m.scallop_of(step, concave, slope)
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
     digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance)) + MORE_DIGITS)
-    top = math.ceil((high + FACING) * 10.0) / 10.0 if m.stock is None else m.stock
-    if top < high:
-        raise InputError(f"⟨stock⟩ must reach the surface's highest point, {high:.6g} mm above Z0, got {top:g} mm")
+    top = _stock(m, high)
     dips = low - m.tool_radius + math.sqrt(m.tool_radius**2 - min(2.0 * over * over, 0.99 * m.tool_radius**2))
     if dips < 0.0:
         raise InputError(
@@ -154,16 +152,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
             _rough(out, m, field, heights, part.lens.opening, top, low, safe)
             out.say("M5", "M0 (change the tool)")
         _begin(out, "ball", m.tool_radius, m.spindle, safe)
-        offset, first = BallOffset(field, heights, m.tool_radius), True
-        move = min(
-            FIRST_MOVE * m.tool_radius, *(2.0 * r / (len(s.breaks) - 1) for s, r in zip(field.spaces, field.half_size, strict=True))
-        )
-        for line in _batches(passes, move):
-            points = with_heights(line, offset, move, tolerance)
-            if first:
-                _descend(out, points[0], top, m.plunge)
-                first = False
-            out.cut(points, m.feed)
+        _finish(out, m, field, heights, passes, top, tolerance)
         out.rapid(z=safe)
         out.say("M5", "M30")
         file.seek(place)
@@ -223,6 +212,29 @@ def _batches(passes: Iterator[np.ndarray], move: float) -> Iterator[np.ndarray]:
             held, moves = [line[-1:]], 0.0
     if sum(map(len, held)) > 1:
         yield np.concatenate(held)
+
+
+def _stock(m: Milling, high: float) -> float:
+    """Height of the stock, mm, for a surface up to `high` mm."""
+    top = math.ceil((high + FACING) * 10.0) / 10.0 if m.stock is None else m.stock
+    if top < high:
+        raise InputError(f"⟨stock⟩ must reach the surface's highest point, {high:.6g} mm above Z0, got {top:g} mm")
+    return top
+
+
+def _finish(
+    out: _Writer, m: Milling, field: HeightField, heights: Tensor, passes: Iterator[np.ndarray], top: float, tolerance: float
+) -> None:
+    """Write the finishing passes, from the top of the stock on."""
+    offset, first = BallOffset(field, heights, m.tool_radius), True
+    spans = (2.0 * r / (len(s.breaks) - 1) for s, r in zip(field.spaces, field.half_size, strict=True))
+    move = min(FIRST_MOVE * m.tool_radius, *spans)
+    for line in _batches(passes, move):
+        points = with_heights(line, offset, move, tolerance)
+        if first:
+            _descend(out, points[0], top, m.plunge)
+            first = False
+        out.cut(points, m.feed)
 
 
 def _rough(

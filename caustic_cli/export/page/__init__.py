@@ -33,7 +33,7 @@ from caustic_cli.io.files import CREATED_BY, write_bytes
 from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene, Screen, Source
+from caustic_cli.scene import Lens, Scene, Screen, Source
 
 #: Cells of the grid along its longer side, the finest that fits is used; multiples of COARSEST, by which the page subsamples it.
 CELLS = (1024, 768, 512, 384)
@@ -116,25 +116,11 @@ def write_page(
         InputError: as in `refuse_untraceable`, or the file cannot be written.
     """
     refuse_untraceable(scene)
-    screen = _coarser(scene.screen)
-    lens = scene.lens
+    screen, kind = _coarser(scene.screen), scene.lens.kind
     data = {
         "title": title,
-        "lens": {
-            "size": list(lens.size),
-            "zIn": lens.z_in,
-            "round": lens.opening.round,
-            "mirror": lens.mirror,
-            "fresnel": ["none", "schlick", "exact"].index(lens.interior.fresnel),
-            "absorption": lens.interior.absorption,
-        },
-        "screen": {
-            "z": screen.z,
-            "low": list(screen.low),
-            "pixel": list(screen.pixel),
-            "resolution": list(screen.resolution),
-            "axes": [list(axis) for axis in screen.axes],
-        },
+        "lens": _lens(scene.lens),
+        "screen": _screen(screen),
         "lights": _lights(scene),
         "encoding": encoding,
         "target": None if target is None else _coded(_onto(target, screen)),
@@ -142,8 +128,8 @@ def write_page(
     }
     words = {
         "title": html.escape(title),
-        "kind": lens.kind,
-        "Kind": lens.kind.capitalize(),
+        "kind": kind,
+        "Kind": kind.capitalize(),
         "rows": _table(rows),
         "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes),
     }
@@ -154,6 +140,29 @@ def write_page(
     page = _assembled(words, data | {"cloud": cloud}).encode()
     assert len(page) <= MOST, len(page)
     write_bytes(path, page)
+
+
+def _lens(lens: Lens) -> dict:
+    """What the page needs of a lens or mirror beside its surface."""
+    return {
+        "size": list(lens.size),
+        "zIn": lens.z_in,
+        "round": lens.opening.round,
+        "mirror": lens.mirror,
+        "fresnel": ["none", "schlick", "exact"].index(lens.interior.fresnel),
+        "absorption": lens.interior.absorption,
+    }
+
+
+def _screen(screen: Screen) -> dict:
+    """The screen, with its lowest corner and its axes."""
+    return {
+        "z": screen.z,
+        "low": list(screen.low),
+        "pixel": list(screen.pixel),
+        "resolution": list(screen.resolution),
+        "axes": [list(axis) for axis in screen.axes],
+    }
 
 
 def _assembled(words: dict[str, str], data: dict) -> str:
