@@ -17,7 +17,7 @@ from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces import HeightField, Plane, Sphere
 from caustic_cli.optics.system import Element, System
 from caustic_cli.optics.trace import Tracer, render, trace
-from caustic_cli.scene import Aperture, PlaneWave, Points, Screen
+from caustic_cli.scene import Aperture, CircularAperture, PlaneWave, Points, Screen
 
 GLASS, FLAT = Medium(1.5), Aperture((5.0, 5.0))
 FIELD = HeightField((SplineSpace.uniform(8, 3), SplineSpace.uniform(7, 2)), (5.0, 5.0))
@@ -48,7 +48,7 @@ ODD = {
     "one side alone": (FAR, (front(Plane()),), 0.96),
     "a round exit": (
         FAR,
-        (front(Plane(), fresnel="none"), back(aperture=Aperture((5.0, 5.0), True), fresnel="none")),
+        (front(Plane(), fresnel="none"), back(aperture=CircularAperture((5.0, 5.0)), fresnel="none")),
         math.pi / 4.0,
     ),
     "a small exit": (FAR, (front(Plane(), fresnel="none"), back(aperture=Aperture((2.0, 2.0)), fresnel="none")), 0.16),

@@ -36,7 +36,7 @@ from caustic_cli.config.table import (
 )
 from caustic_cli.errors import InputError, alternatives, near
 from caustic_cli.io.files import read_bytes
-from caustic_cli.scene import Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
+from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
 from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import PLANE, Sags
@@ -413,18 +413,17 @@ def _component(element: ElementSettings, wavelength: float) -> Component:
             raise InputError(f"⟨element.{key}⟩ is for lenses: light never enters a mirror")
     if {"index", "glass"} <= {*element}:
         raise InputError("[[element]] takes index or glass, not both")
-    return Component(
-        kind,
+    return COMPONENTS[kind](
         element.z,
         element.size,
-        element.thickness,
-        element.radius or PLANE,
-        refractive_index(element.glass, wavelength) if element.glass else element.index,
-        element.absorption,
-        element.glass,
-        element.aperture,
-        element.tilt or (0.0, 0.0),
-        element.free,
+        radius=element.radius or PLANE,
+        index=refractive_index(element.glass, wavelength) if element.glass else element.index,
+        glass=element.glass,
+        tilt=element.tilt or (0.0, 0.0),
+        thickness=element.thickness,
+        absorption=element.absorption,
+        aperture=element.aperture,
+        free=element.free,
     )
 
 

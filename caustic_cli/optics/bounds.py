@@ -74,9 +74,9 @@ def check_exit_above_entrance(scene: Scene, field: HeightField, heights: Tensor)
         InputError: giving the depth by which it does.
     """
     lens = scene.lens
-    if lens.mirror or float(heights.min()) >= lens.z_in:  # the convex hull of the net contains the surface
+    if float(heights.min()) >= lens.interaction.base(lens.z_in):  # the convex hull of the net contains the surface
         return
-    dip = lens.z_in - field.least(heights, lens.round)
+    dip = lens.z_in - field.least(heights, lens.opening)
     if dip > 0:
         raise InputError(
             f"⟨lens.z_in⟩ of {lens.z_in:g} mm lies above a part of the exit surface, which dips {dip:.3g} mm below it; it must"
@@ -89,7 +89,7 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
     least, most = min(indices), max(indices)
     pupil = scene.pupil
-    incidence = _through(scene, scene.source.incidence(pupil.half_size, pupil.z, pupil.round))
+    incidence = _through(scene, scene.source.incidence(pupil))
     depth = float(heights.max()) - lens.z_in
     low, high, steepest = medium_of(lens).variation(lens.half_size, depth)
     least, most, bent = least * low, most * high, steepest * depth / (low * lens.index)
@@ -106,12 +106,7 @@ def _exit(scene: Scene, inside: float, slope: float, most: float, heights: Tenso
     """Bounds at the exit, from the angle of rays inside, the slope bound and the largest index."""
     lens = scene.lens
     lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)  # of the microfacets' normals to z
-    i = inside + lean
-    if lens.mirror:
-        critical, out = 0.0, inside + 2.0 * lean
-    else:
-        critical = most * math.sin(min(i, math.pi / 2.0))
-        out = inside + math.asin(critical) - i if critical < 1.0 else math.pi / 2.0
+    critical, out = lens.interaction.leaving_bounds(inside, lean, most)
     slope_ratio = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
     return ExitBounds(slope, critical, slope_ratio, _reach(scene, inside, float(heights.min()), float(heights.max())))
 
@@ -152,24 +147,20 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     drift = (top - lens.z_in - low) * math.tan(min(inside, 1.57))
     if source.distant:
         return 1.0 + drift / min(lens.half_size)
-    positions, extent, cone = source.points()[0], source.extent, source.cone_over(lens.half_size, lens.z_in, lens.round)
+    positions, extent, cone = source.points()[0], source.extent, source.cone_over(lens.pupil)
     wide = (lens.z_in - positions[:, 2]) * math.tan(cone) if cone < math.pi / 2.0 else np.full(len(positions), math.inf)
-    if lens.round:
-        far = np.hypot(*(np.abs(positions[:, k]) + extent[k] for k in (0, 1))) + wide
-        return float((np.minimum(far, lens.half_size[0]) + drift).max()) / lens.half_size[0]
-    return max(
-        float(((np.minimum(np.abs(positions[:, k]) + extent[k] + wide, r) + drift) / r).max()) for k, r in enumerate(lens.half_size)
-    )
+    far = lens.opening.distances(*(np.abs(positions[:, k]) + extent[k] for k in (0, 1)))
+    return max(float(((np.minimum(d + wide, r) + drift) / r).max()) for d, r in far)
 
 
 def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: float) -> float:
     """Bound of the fraction of the power that is reflected at the exit and then at the entrance: an average over the knot spans for
     a uniform plane wave, their maximum for other light."""
     lens, kind = scene.lens, scene.lens.fresnel
-    if lens.mirror:
+    if "ghosts" in lens.interaction.lacks:
         return 0.0
     if scene.elements:  # of every pair of refracting surfaces, at normal incidence
-        surfaces, n = 2 + sum(len(e.sides) for e in scene.elements if not e.mirror), max(n, *(e.index for e in scene.elements))
+        surfaces, n = 2 + sum(len(e.refracting) for e in scene.elements), max(n, *(e.index for e in scene.elements))
         return 0.0 if kind == "none" else surfaces * (surfaces - 1) / 2 * ((n - 1.0) / (n + 1.0)) ** 4
     slope, area = _slopes(field, heights.detach().double().cpu())
     lean = torch.atan(slope + lens.roughness * LARGEST_NORMAL)
@@ -188,7 +179,7 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
         return torch.where(square > 0, value, torch.ones_like(value))
 
     both = part(inside + lean) * part(inside + 2.0 * lean)
-    even = scene.axial and scene.source.profile is None and not lens.round
+    even = scene.axial and scene.source.profile is None and not lens.opening.round
     return float((both * area).sum() if even else both.max())
 
 

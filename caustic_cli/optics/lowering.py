@@ -29,7 +29,7 @@ def lowered(tracer, before: Fused | None) -> Fused | None:
     eta = inside.index_at(start.wavelength) / outside.index_at(start.wavelength)
     if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface
         return None
-    if tracer.sides[-1] < 0 or (start.along_axis and element.aperture.round != pupil.round):
+    if tracer.sides[-1] < 0 or (start.along_axis and element.aperture != pupil.aperture):
         return None
     if start.along_axis:
         return tracer.backend.plane_image(surface, start, eta, element.fresnel, before)

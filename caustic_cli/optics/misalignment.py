@@ -141,13 +141,11 @@ class Misalignment:
         lens, since that cone changes with the source's position."""
         before = scene.source
         if before.profile is not None and changed.source.profile is not None:
-            after, whole = (mean_irradiance(one, scene.pupil.round) for one in (changed.source.profile, before.profile))
+            after, whole = (mean_irradiance(one, scene.pupil.aperture) for one in (changed.source.profile, before.profile))
             return after / whole
         if before.distant or before.cone is not None or before.rays is not None:
             return 1.0
-        after, whole = (
-            relative_flux(s.source, s.source.cone_over(s.lens.half_size, s.lens.z_in, s.lens.round)) for s in (changed, scene)
-        )
+        after, whole = (relative_flux(s.source, s.source.cone_over(s.lens.pupil)) for s in (changed, scene))
         return after / whole
 
     def directed(self, scene: Scene, source: Source, state: RayState) -> RayState:
@@ -219,6 +217,4 @@ def reason_ignored(scene: Scene, error: str) -> str:
         return "the source is at a finite distance; source_shift moves it"
     if error == "source_size" and not any(one.sized for one in source.members):
         return f"{source.label} has no size"
-    if error == "index" and scene.lens.mirror:
-        return "a mirror has no index"
-    return ""
+    return scene.lens.interaction.lacks.get(error, "")

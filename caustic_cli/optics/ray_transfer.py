@@ -14,6 +14,7 @@ from torch import Tensor
 from caustic_cli.optics.frames import advance, to_global, to_local
 from caustic_cli.optics.rays import Hit, RayState
 from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
+from caustic_cli.scene import Aperture
 
 
 def meet(tracer, m, heights: Tensor | None) -> None:
@@ -59,15 +60,13 @@ def _at_pupil(system, m) -> bool:
 
 def _is_pupil(element, system) -> bool:
     """Whether an element's aperture is that of the pupil."""
-    aperture, pupil = element.aperture, system.pupil
-    return (aperture.half_size, aperture.round) == (pupil.half_size, pupil.round)
+    return element.aperture == system.pupil.aperture
 
 
 def _passed(element, hit: Hit, found: Tensor) -> Tensor:
     """Which of the rays `found` to meet an element's surface are within its aperture."""
-    aperture = element.aperture
-    if aperture.round or aperture.half_size != element.surface.half_size:
-        found = found & aperture.contains(*hit.local[:2])
+    if element.aperture != Aperture(element.surface.half_size):
+        found = found & element.aperture.contains(*hit.local[:2])
     return found
 
 

@@ -173,6 +173,6 @@ def local_magnification(scene: Scene, field: HeightField, heights: Tensor) -> fl
     light = paraxial(scene, field, heights)
     if light is None:
         return None
-    gain = light.throw * (2.0 if scene.lens.mirror else scene.lens.index - 1.0)
+    gain = light.throw * abs(scene.lens.effective_index - 1.0)
     xx, xy, yy = gain * light.xx, gain * light.xy, gain * light.yy
     return float(((light.straight + xx) * (light.straight + yy) - xy * xy).abs().mean().sqrt())

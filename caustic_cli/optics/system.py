@@ -127,11 +127,8 @@ def _elements_of(
             surface = Sphere(radius, component.reach) if math.isfinite(radius) else Plane()
         pose = leg.pose(component.vertex(side), component.tilt)
         name, opening = surface_name(number, side), component.opening
-        if component.mirror:
-            found.append(Element(name, surface, opening, "reflect", pose=pose))
-        else:
-            behind = glass if side == "front" else AIR
-            found.append(Element(name, surface, opening, behind=behind, pose=pose, fresnel=scene.lens.fresnel))
+        behind = glass if side == "front" else AIR
+        found.append(Element(name, surface, opening, component.interaction.name, behind, pose, scene.lens.fresnel))
     return found
 
 
@@ -188,29 +185,25 @@ class System:
         lens = scene.lens
         surface = surface or HeightField.of(lens)
         entrance = Plane() if not scene.two_sided else surface if lens.entrance is None else entrance_of(lens)
-        aperture = Aperture(lens.half_size, lens.round)
-        elements: tuple[Element, ...]
-        if lens.mirror:
-            elements = (Element(EXIT, surface, aperture, "reflect", roughness=lens.roughness),)
-        else:
-            elements = (
-                Element(
-                    ENTRANCE,
-                    entrance,
-                    aperture,
-                    behind=medium_of(lens),
-                    pose=Pose((0.0, 0.0, lens.z_in)),
-                    fresnel=lens.fresnel,
-                ),
-                Element(EXIT, surface, aperture, fresnel=lens.fresnel, roughness=lens.roughness),
+        elements: tuple[Element, ...] = (
+            Element(EXIT, surface, lens.opening, lens.interaction.name, fresnel=lens.fresnel, roughness=lens.roughness),
+        )
+        if not lens.mirror:
+            first = Element(
+                ENTRANCE,
+                entrance,
+                lens.opening,
+                behind=medium_of(lens),
+                pose=Pose((0.0, 0.0, lens.z_in)),
+                fresnel=lens.fresnel,
             )
+            elements = (first, *elements)
         lit, leg = None if scene.two_sided or scene.before else scene.pupil, AxisSegment()
-        if scene.elements:
-            first, number = elements, len(scene.before)
-            elements = tuple(e for k, c in enumerate(scene.before) for e in _elements_of(c, k, leg, scene, surface.spaces)) + first
-            for k, component in enumerate(scene.behind, number):
-                elements += tuple(_elements_of(component, k, leg, scene, surface.spaces))
-                leg = leg.folded(component.z, component.tilt) if component.mirror else leg
+        ahead = tuple(e for k, c in enumerate(scene.before) for e in _elements_of(c, k, leg, scene, surface.spaces))
+        elements = (*ahead, *elements)
+        for k, component in enumerate(scene.behind, len(scene.before)):
+            elements += tuple(_elements_of(component, k, leg, scene, surface.spaces))
+            leg = component.axis_behind(leg)
         return cls((scene.source,), elements, (scene.screen,), scene.light, lit=lit, leg=leg if leg != AxisSegment() else None)
 
     def placed(self, screen: Screen) -> PlacedScreen:
@@ -227,7 +220,7 @@ class System:
         if self.lit is not None:
             return self.lit
         first = self.elements[0]
-        return Pupil(first.aperture.half_size, first.pose.position[2], first.aperture.round)
+        return Pupil(first.aperture, first.pose.position[2])
 
     @property
     def free(self) -> dict[str, tuple[int, int]]:

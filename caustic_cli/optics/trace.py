@@ -459,16 +459,12 @@ def check_clearance(scene: Scene, heights: Tensor, screen: Screen) -> None:
     Raises:
         InputError: giving the extreme height of the surface.
     """
-    before, behind = reach(screen)
-    nearer = behind if scene.lens.mirror else -before
+    lens, side = scene.lens, scene.lens.interaction.side
+    nearer = max(-side * bound for bound in reach(screen))
     lean = f" and its {'shape' if screen.curved else 'tilt'} takes it {nearer:.4g} mm nearer" if nearer else ""
-    if scene.lens.mirror:
-        if float(heights.min()) <= screen.z + nearer:
-            raise InputError(
-                f"⟨screen.z⟩ must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
-                f" got {screen.z:g} mm{lean}"
-            )
-    elif float(heights.max()) >= screen.z - nearer:
+    top = side * float((side * heights).max())
+    if side * (screen.z - top) <= nearer:
         raise InputError(
-            f"⟨screen.z⟩ must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm, got {screen.z:g} mm{lean}"
+            f"⟨screen.z⟩ must lie {lens.interaction.beyond} the {lens.kind}, whose surface reaches {top:.6g} mm,"
+            f" got {screen.z:g} mm{lean}"
         )

@@ -1,8 +1,8 @@
 """What a scene may have beyond the simplest one, and what each capability of this program does not support of it.
 
-The simplest scene is a clear lens of one refractive index with a flat entrance, unpolarised light of one wavelength from one source,
-and a plane screen, upright and centred on the axis.  Whatever does not support every trait (an export format, the interactive page,
-a study) says so in one `Capability`, from which its refusals and the matrix in the documents are made.
+The simplest scene is a clear lens of one refractive index with a flat entrance, unpolarised light of one wavelength from one
+source, and a plane screen, upright and centred on the axis.  Whatever does not support every trait (an export format, the
+interactive page, a study) says so in one `Capability`, from which its refusals and the matrix in the documents are made.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TRAITS: Mapping[str, Trait] = {
     "two sides": Trait("a free-form entrance", lambda s: s.two_sided),
     "other elements": Trait("other elements beside it", lambda s: bool(s.elements)),
     "lenslet array": Trait("lenslets", lambda s: s.lens.arrayed),
-    "circular aperture": Trait("a circular aperture", lambda s: s.lens.round),
+    "circular aperture": Trait("a circular aperture", lambda s: s.lens.opening.round),
     "absorption": Trait("absorption", lambda s: s.lens.absorption > 0 or any(e.absorption > 0 for e in s.elements)),
     "roughness": Trait("roughness", lambda s: s.lens.roughness > 0),
     "polarisation": Trait("polarised light", lambda s: s.light.polarisation is not None),

@@ -272,7 +272,7 @@ def _row(
 ) -> dict | None:
     name, amount, bare = effect.name, OWN, None
     if not effect.present:
-        made = BY_NAME[name].probe(scene, heights)
+        made = None if BY_NAME[name].of_glass and scene.lens.mirror else BY_NAME[name].probe(scene, heights)
         if made is None:
             return None
         scene, bare, amount = made.scene, made.baseline, made.words

@@ -193,7 +193,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     filter = filter_from(asked.reconstruction, asked.filter_size, scene.screen, asked.alpha)
     seed = lens.seed if asked.seed is None else asked.seed
     cut = None if asked.cut is None else cut_surface(asked.cut, scene, lens.field, asked.tool_radius)
-    deviation = {} if cut is None else form_deviation(cut, lens.field, lens.heights, scene.lens.round)
+    deviation = {} if cut is None else form_deviation(cut, lens.field, lens.heights, scene.lens.opening)
     plan = lens.plan(asked.effects, deviation.get("cut_slope_most", 0.0))
     if coarse := coarse_words(scene):
         say.say(coarse)

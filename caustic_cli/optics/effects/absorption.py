@@ -18,10 +18,11 @@ class Absorption(Effect):
     """Without it the glass is perfectly transparent."""
 
     name = "absorption"
+    of_glass = True
 
     def decide(self, scene: Scene, bounds) -> Decision:
         """Needed if a coefficient is above 0."""
-        a = 0.0 if scene.lens.mirror else max(scene.lens.absorption, *(e.absorption for e in scene.elements), 0.0)
+        a = max(scene.lens.interior.absorption, *(e.absorption for e in scene.elements), 0.0)
         why = f"the glass absorbs {a:g} per mm" if a > 0 else "the glass is clear"
         return Decision(self.name, a > 0, why, a, 0.0, present=a > 0)
 
@@ -34,8 +35,6 @@ class Absorption(Effect):
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """Weak absorption."""
-        if scene.lens.mirror:
-            return None
         return Probe(replace(scene, lens=replace(scene.lens, absorption=AMOUNT)), None, f"{AMOUNT:g} per mm")
 
     def action(self, system, requests: Requests) -> Action:

@@ -105,10 +105,12 @@ class Effect(ABC):
     free = False
     #: Whether it affects the wave image only.
     waves = False
+    #: Whether it is one of glass, which a mirror does not have.
+    of_glass = False
 
     @abstractmethod
     def decide(self, scene: Scene, bounds: Bounds) -> Decision:
-        """Whether a scene needs the effect, and why."""
+        """Whether a scene needs the effect, and why; not asked where its lens or mirror lacks it."""
 
     def without(self, scene: Scene) -> Scene:
         """The scene without the effect."""

@@ -22,6 +22,7 @@ class GradientIndex(Effect):
     """Without it the lens is homogeneous."""
 
     name = "gradient-index"
+    of_glass = True
 
     def decide(self, scene: Scene, bounds) -> Decision:
         """By a bound of the displacement on the screen due to the curvature of rays and to the deviation of the index.
@@ -49,8 +50,6 @@ class GradientIndex(Effect):
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """A weak radial gradient with the index decreasing towards the edge."""
         lens = scene.lens
-        if lens.mirror:
-            return None
         depth, edge = lens.offset.thickness - lens.z_in, min(lens.half_size)
         if not depth > 0:
             return None

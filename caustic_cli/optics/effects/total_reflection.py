@@ -18,8 +18,6 @@ class TotalReflection(Effect):
 
     def decide(self, scene: Scene, b) -> Decision:
         """By the bound of n sin i."""
-        if scene.lens.mirror:
-            return Decision(self.name, False, "a mirror has no critical angle", present=False)
         at = b.exit
         if at.critical < 1.0 and not scene.elements:
             return Decision(self.name, False, f"n sin i <= {at.critical:.4g} at slopes up to {at.slope:.3g}", at.critical, 1.0)

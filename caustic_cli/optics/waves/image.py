@@ -111,8 +111,8 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
     states = (0.0, 90.0) if scene.light.tracked and scene.light.polarisation is None else (scene.light.polarisation,)
     for wavelength, part, channel in zip(given, parts, channels, strict=True):
         lens = replace(scene.lens, roughness=0.0)
-        if lens.glass is not None and not lens.mirror:
-            lens = replace(lens, index=refractive_index(lens.glass, wavelength))
+        if (glass := lens.interior.glass) is not None:
+            lens = replace(lens, index=refractive_index(glass, wavelength))
         for state in states:
             if (lens.index, state) not in systems:  # light of one index and polarisation takes the same paths
                 one = replace(scene, lens=lens, light=Light(state))

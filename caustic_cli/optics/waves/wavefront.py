@@ -174,8 +174,7 @@ def survey(optics: Optics) -> Survey:
     f = optics.intercepts(u, v)
     lit = f.power > 0
     pupil = optics.mode.scene.pupil
-    if pupil.round:
-        lit &= (2.0 * u - 1.0) ** 2 + (2.0 * v - 1.0) ** 2 <= 1.0 + 1e-12
+    lit &= pupil.aperture.covers(2.0 * u - 1.0, 2.0 * v - 1.0, 1e-12)
     if int(lit.sum()) < 16:
         raise NoWaveImage("no light reaches the screen, so it has no wave image")
     light, landing = (
@@ -192,7 +191,7 @@ def survey(optics: Optics) -> Survey:
             if float(end) != edge:  # an edge within the pupil, somewhere between this point and the next
                 reach = (high if upper else low) + (1.0 if upper else -1.0) * abs(scale[-1]) / (SURVEY - 1)
             else:  # the survey's points may miss a circle's edge
-                reach = offset[-1] + scale[-1] * edge if pupil.round else low
+                reach = offset[-1] + scale[-1] * edge if pupil.aperture.round else low
             low, high = (low, max(high, reach)) if upper else (min(low, reach), high)
         lows.append(low)
         highs.append(high)
@@ -350,7 +349,7 @@ def _density(
     by_x, by_y = torch.gradient(power.detach(), spacing=step, dim=(0, 1), edge_order=2)
     density = (power + torch.where(dark, torch.zeros_like(ex), by_x * ex + by_y * ey)).clamp_min(0.0) * squeeze.clamp_min(0.0)
     rx, ry = (abs(s) / 2.0 for s in seen.scale)
-    edge_x, edge_y = (rx - torch.hypot(px, py * (rx / ry)), None) if pupil.round else (rx - px.abs(), ry - py.abs())
+    edge_x, edge_y = pupil.aperture.edges(px, py, (rx, ry))
     return density, Lit(edge_x, edge_y, (~dark).double() if bool(dark.any()) else None)
 
 
