@@ -15,7 +15,7 @@ from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Pupil, Scene
+from caustic_cli.scene import Aperture, Pupil, Scene
 
 #: Part of the lens by which the light reaches beyond it on every side, and how far before the entrance it starts, mm.
 BEYOND, BEFORE = 0.05, 2.0
@@ -30,7 +30,7 @@ def room(scene: Scene, field: HeightField, e) -> tuple[System, PlacedScreen]:
     poses = (stand, Pose(foot, e.lens_tilt))
     elements = tuple(replace(element, pose=pose) for element, pose in zip(plain.elements, poses, strict=True))
     half = tuple(2.0 * r for r in scene.lens.half_size)
-    lit = Pupil((half[0], half[1]), scene.lens.z_in - BEFORE)
+    lit = Pupil(Aperture((half[0], half[1])), scene.lens.z_in - BEFORE)
     s = scene.screen
     middle = (s.shift[0] + e.screen_shift[0], s.shift[1] + e.screen_shift[1], s.z + e.throw)
     tilt = (s.tilt[0] + e.screen_tilt[0], s.tilt[1] + e.screen_tilt[1])

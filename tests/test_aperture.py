@@ -15,18 +15,19 @@ from test_verify import NAMES, SOURCES, scene_with
 
 from caustic_cli import cli
 from caustic_cli.errors import CausticError, InputError
+from caustic_cli.export.lattice import LATTICES
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.lighttools_script import refuse
-from caustic_cli.export.mesh import FLANGE, closed_mesh, patch, rim_of
+from caustic_cli.export.mesh import FLANGE, closed_mesh, rim_of
 from caustic_cli.export.mitsuba import companions, write_mitsuba
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.rays import Status
+from caustic_cli.optics.rays import RayStatus
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
-from caustic_cli.scene import Lens, PlaneWave, Points, Scene
+from caustic_cli.scene import Aperture, CircularAperture, Lens, PlaneWave, Points, Pupil, Scene
 from caustic_cli.studies import verify
 
 
@@ -54,8 +55,8 @@ def test_bad_outlines_are_refused(change):
 
 def test_a_cone_that_covers_a_circle():
     source = Points(((3.0, 4.0, -20.0),))
-    assert np.tan(source.cone_over((6.0, 6.0), 0.0, True)) * 20 == pytest.approx(5 + 6)
-    assert np.tan(source.cone_over((6.0, 6.0), 0.0)) * 20 == pytest.approx(np.hypot(9, 10))
+    assert np.tan(source.cone_over(Pupil(CircularAperture((6.0, 6.0)), 0.0))) * 20 == pytest.approx(5 + 6)
+    assert np.tan(source.cone_over(Pupil(Aperture((6.0, 6.0)), 0.0))) * 20 == pytest.approx(np.hypot(9, 10))
 
 
 # light
@@ -72,7 +73,7 @@ def test_no_light_beyond_the_circle_and_the_energy_balance_closes(source, kernel
         else:
             (x, y, _), power = rays.origin, rays.power
             (hits,) = Tracer(System.of(scene, field), rays, track=True).land({EXIT: heights}, scene.screen)
-            beyond = hits.statuses() == Status.MISSED_SURFACE
+            beyond = hits.statuses() == RayStatus.MISSED_SURFACE
             assert not float(hits.power[beyond].abs().sum()) > 0
         fluxes += float(power.sum())
         assert not float(power[x * x + y * y > 16.0].sum()) > 0
@@ -162,7 +163,7 @@ def test_meshes_with_every_outline_are_closed(aperture, border):
     np.testing.assert_allclose(vertices[:, :2].max(0), (rx + border, ry + border), rtol=1e-12)
     a, b, c = vertices[faces].swapaxes(0, 1)
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).min() > 2e-6  # twice the area, mm^2
-    points = patch(scene.lens, field, heights, (41, 41)).points
+    points = LATTICES[aperture].patch(field, heights, (41, 41)).points
     low = points.reshape(-1, 3)[rim_of(41, 41), 2].min() - scene.lens.z_in
     wide = np.pi * (rx + border) ** 2 if aperture == "circle" else 4 * (rx + border) * (ry + border)
     hole = np.pi * rx**2 if aperture == "circle" else 4 * rx * ry
@@ -172,8 +173,8 @@ def test_meshes_with_every_outline_are_closed(aperture, border):
 
 
 def test_a_round_mesh_lies_on_the_surface():
-    scene, field, heights = rounded(make(size=(8.0, 8.0)))
-    p = patch(scene.lens, field, heights, (33, 33))
+    _, field, heights = rounded(make(size=(8.0, 8.0)))
+    p = LATTICES["circle"].patch(field, heights, (33, 33))
     x, y, z = p.points.reshape(-1, 3).T
     exact, zx, zy = (t.numpy() for t in field.at(heights, torch.as_tensor(x.copy()), torch.as_tensor(y.copy())))
     assert np.abs(z - exact).max() < 1e-12
@@ -250,7 +251,7 @@ def test_mitsuba_agrees_on_round_lenses(tmp_path, source):
         pytest.skip("Mitsuba is not installed")
     scene, field, heights = round_with(source)
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (257, 257), dark=True)
-    assert all(p.is_file() for p in companions(tmp_path / "lens.xml"))
+    assert all(p.is_file() for p in companions(tmp_path / "lens.xml", scene))
     try:
         decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, 100_000)
     except CausticError as error:

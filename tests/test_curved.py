@@ -36,7 +36,8 @@ from caustic_cli.optics.screen_shape import areas, normals, points_in_space, rea
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer, expose, is_lowered, tracers
-from caustic_cli.optics.waves import NoWaveImage, wave_image
+from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.screen import Sags
 from caustic_cli.studies.irradiance import irradiance, irradiance_figures
@@ -420,7 +421,7 @@ def test_a_design_says_that_it_leaves_waves_out():
     """By default the wave image is refined where diffraction matters; not on a curved screen, and a line says why."""
     for screen, stages in (({}, True), ({"radius": [60.0, 60.0]}, False)):
         full = complete({"screen": screen}, 1.0)
-        assert any(stage.get("waves") for stage in full["design"]["stages"]) == stages
+        assert any(stage.waves for stage in full.design.stages) == stages
         assert without_waves(full, False) == ("" if stages else "a curved screen has no wave image")
     scene = scene_of(screen_of(SPHERE))
     assert not compile_plan(scene, HeightField.of(scene.lens), bumpy(scene))["diffraction"].on

@@ -301,9 +301,9 @@ def test_the_wall_of_a_plate_is_what_was_said(capfd, said, wall):
 def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeypatch):
     monkeypatch.setattr(workflow, "_run", begun)
     design(capfd, "blob.png", "--resolution", "24", "--waves", "off", "--quiet", "--threads", "1", "--time-limit", limit, "-o", "p")
-    stages = workflow.Project.open("p").settings["design"]["stages"]
-    assert stages[-1]["control"] == [control + 3, control + 3]
-    assert stages[-1]["rays"] == rays and len(stages) == {5: 1, 20: 2, 90: 3}[limit]
+    stages = workflow.Project.open("p").settings.design.stages
+    assert stages[-1].control == (control + 3, control + 3)
+    assert stages[-1].rays == rays and len(stages) == {5: 1, 20: 2, 90: 3}[limit]
 
 
 @pytest.mark.parametrize("limit, stages", [(20, 1), (90, 2)])
@@ -311,7 +311,7 @@ def test_a_source_with_an_extent_takes_longer(capfd, limit, stages, monkeypatch)
     monkeypatch.setattr(workflow, "_run", begun)
     sun = ("--source-angle", "0.533", "--resolution", "24", "--waves", "off", "--quiet", "--threads", "1")
     design(capfd, "blob.png", *sun, "--time-limit", limit, "-o", "p")
-    assert len(workflow.Project.open("p").settings["design"]["stages"]) == stages
+    assert len(workflow.Project.open("p").settings.design.stages) == stages
 
 
 def test_lbfgs_never_goes_uphill_within_a_stage(capfd):
@@ -389,7 +389,7 @@ def test_a_time_limit_reaches_the_last_stage(capfd):
     """However short: a lens on a coarse net alone would not be the lens of project.toml."""
     design(capfd, "blob.png", *TINY, *NARROW, "--time-limit", 0.01)
     state = load("blob.caustic").state
-    stages = workflow.Project.open("blob.caustic").settings["design"]["stages"]
+    stages = workflow.Project.open("blob.caustic").settings.design.stages
     assert state.stage == len(stages) - 1 and tuple(state.heights.shape) == (12, 12)
 
 

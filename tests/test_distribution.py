@@ -334,7 +334,7 @@ def test_designs_keep_their_files(here, capfd, source, kept):
         capfd, "render", "blob.caustic", "--rays", "40000", "--force", "--effects", "entrance,intersection,fresnel,source-size"
     )
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], rel=0.05)
-    assert workflow.Project.open("blob.caustic").settings["source"]["intensity"] == (
+    assert workflow.Project.open("blob.caustic").settings.source.intensity == (
         "intensity.csv" if "intensity.csv" in kept else "lambertian" if "lambertian" in source else "uniform"
     )
 

@@ -169,9 +169,9 @@ def test_dispersion_of_a_glass_and_its_range(capfd):
 def test_a_coloured_target(capfd):
     figures = run(capfd, "design", "rgb.png", "--color", *TINY)
     project = workflow.Project.open("rgb.caustic")
-    assert project.settings["source"]["wavelengths"] == list(RGB) and project.settings["lens"]["glass"] == "N-BK7"
+    assert project.settings.source.wavelengths == tuple(RGB) and project.settings.lens.glass == "N-BK7"
     light = project.picture.irradiance().sum((1, 2))
-    assert project.settings["source"]["weights"] == pytest.approx(list(light / light.sum()))
+    assert project.settings.source.weights == pytest.approx(list(light / light.sum()))
     assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-9)
     run(capfd, "render", "rgb.caustic", "--rays", "4000", "--npy", "out.npy", "-o", "out.png", "--quiet")
     image = np.load("out.npy")
@@ -277,7 +277,7 @@ def test_bad_values_are_named(changes, message):
     full = complete({}, 1.0)
     for name, value in changes.items():
         section, _, key = name.partition("_")
-        full[section][key] = value
+        full = full.changed(**{section: getattr(full, section).changed(**{key: value})})
     with pytest.raises(InputError) as error:
         settings.build_scene(full)
     assert message in str(error.value)

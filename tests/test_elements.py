@@ -32,7 +32,7 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField, Sphere
 from caustic_cli.optics.system import EXIT, System, split_heights
 from caustic_cli.optics.trace import Tracer, expose, render
-from caustic_cli.scene import Component, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Component, FoldMirror, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.retrace import retrace
 
 PIXELS = 32
@@ -43,11 +43,11 @@ FIELD = HeightField.of(LENS)
 
 
 def thick(z: float, size: float = 12.0, radius=(60.0, -90.0), thickness: float = 4.0, index: float = 1.6, **more) -> Component:
-    return Component("lens", z, (size, size), thickness, radius, index, **more)
+    return Component(z, (size, size), thickness, radius, index, **more)
 
 
-def mirror(z: float, tilt, radius: float = math.inf, size: float = 70.0) -> Component:
-    return Component("mirror", z, (size, size), radius=(radius, math.inf), tilt=tilt)
+def mirror(z: float, tilt, radius: float = math.inf, size: float = 70.0) -> FoldMirror:
+    return FoldMirror(z, (size, size), radius=(radius, math.inf), tilt=tilt)
 
 
 def matrix(radius, thickness: float, index: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from caustic_cli.optics.emission import Emission, rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer, expose
-from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Aperture, Disc, Lens, Offset, PlaneWave, Points, Pupil, Scene, Screen
 
 LENS = Lens(size=(10.0, 8.0), control=(8, 7), z_in=0.0, index=1.5, fresnel="none")
 
@@ -201,7 +201,7 @@ def test_impossible_sources_are_refused(source, message):
 
 def test_the_covering_cone_reaches_every_corner():
     source = Points(((2.0, 1.0, -6.0),))
-    assert math.tan(source.cone_over((5.0, 4.0), 0.0)) * 6.0 == pytest.approx(math.hypot(7.0, 5.0))
+    assert math.tan(source.cone_over(Pupil(Aperture((5.0, 4.0)), 0.0))) * 6.0 == pytest.approx(math.hypot(7.0, 5.0))
     assert bool((whole(source).power > 0).all())
 
 

@@ -349,8 +349,7 @@ def test_the_middle_shines_into_the_cone_of_the_whole():
     """So that as much of its light meets the lens."""
     scene = scene_of(SOURCES["disc"])
     middle = point_source(scene)
-    half, z = scene.lens.half_size, scene.lens.z_in
-    assert middle.cone_over(half, z) == pytest.approx(scene.source.cone_over(half, z))
+    assert middle.cone_over(scene.lens.pupil) == pytest.approx(scene.source.cone_over(scene.lens.pupil))
     assert point_source(scene_of(SOURCES["sun"])).collimated
 
 

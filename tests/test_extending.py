@@ -246,7 +246,7 @@ SURFACE = Addition(
             "from caustic_cli.optics.surfaces.plane import Plane\n",
             "from caustic_cli.optics.surfaces.paraboloid import Paraboloid\nfrom caustic_cli.optics.surfaces.plane import Plane\n",
         ),
-        ("optics/surfaces/__init__.py", '"Nurbs", "Plane"', '"Nurbs", "Paraboloid", "Plane"'),
+        ("optics/surfaces/__init__.py", '"HeightField", "Plane"', '"HeightField", "Paraboloid", "Plane"'),
     ),
     used="""
     import torch
@@ -304,7 +304,7 @@ from caustic_cli.optics.trace import expose
 
 full = complete(settings.parse('[source]\\ntype = "spokes"\\nspokes = 7\\n[lens]\\ncontrol = [8, 8]', "here"), 1.0)
 again = settings.parse(settings.dump(full), "there")
-scene = settings.build_scene(again)
+scene = settings.build_scene(settings.Settings.of(again))
 rays = rays_of(scene, "stratified", 6300)
 exposure = expose(scene, HeightField.of(scene.lens), torch.full((8, 8), 5.0, dtype=torch.float64), rays)
 assert abs(float(exposure.image.sum()) + sum(exposure.lost.values()) - 1.0) < 1e-12
@@ -322,7 +322,6 @@ KIND = Addition(
 
     from dataclasses import replace
 
-    from caustic_cli.config.settings import value_of
     from caustic_cli.inverse.mixture import Member, Mixture
     from caustic_cli.kinds.surface import OneSurface
 
@@ -338,11 +337,11 @@ KIND = Addition(
 
         @classmethod
         def applies(cls, s):
-            return value_of(s["design"], "design.farther") > 0
+            return s.design.farther > 0
 
         @classmethod
         def further(cls, described, scene):
-            return {"farther": value_of(described.settings["design"], "design.farther")}
+            return {"farther": described.settings.design.farther}
 
         @property
         def scenes(self):
@@ -368,9 +367,9 @@ KIND = Addition(
         ("kinds/__init__.py", "    RobustSurface,\n", "    RobustSurface,\n    TwoThrows,\n"),
         (
             "config/table.py",
-            '    Setting("design.over", ',
-            '    Setting("design.farther", "number", "z of another screen with the same picture", "mm", 0.0, default=0.0,\n'
-            '            written=False),\n    Setting("design.over", ',
+            "    over: str = setting(",
+            '    farther: float = setting("z of another screen with the same picture", "mm", 0.0, default=0.0, written=False)\n'
+            "    over: str = setting(",
         ),
     ),
     used="""

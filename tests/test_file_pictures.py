@@ -16,8 +16,8 @@ from test_roundtrip import grid_of, hermite, read_zemax, step_field
 
 from caustic_cli.errors import InputError
 from caustic_cli.export import FORMATS
-from caustic_cli.export.mesh import patch, triangles
-from caustic_cli.export.reading import of_facets, of_patches, of_points, of_vertices
+from caustic_cli.export.lattice import LATTICES, triangles
+from caustic_cli.export.reading import of_patches, of_points
 from caustic_cli.export.surface import sample_grid, samplings
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.facets import FacetSurface
@@ -265,14 +265,14 @@ def test_points_are_read_as_scipy_reads_them(shape):
 @pytest.mark.parametrize("round", [False, True])
 def test_facets_are_those_of_the_mesh(round):
     """Height and slope at points inside of every triangle, which the triangle's own corners give."""
-    scene, field, heights = make(control=(9, 9), size=(10.0, 10.0), relief=0.1)
-    scene = replace(scene, lens=replace(scene.lens, aperture="circle" if round else "rectangle"))
-    one = patch(scene.lens, field, heights, (14, 14))
+    _, field, heights = make(control=(9, 9), size=(10.0, 10.0), relief=0.1)
+    lattice = LATTICES["circle" if round else "rectangle"]
+    one = lattice.patch(field, heights, (14, 14))
     faces = triangles(one.points)
     corners = one.points.reshape(-1, 3)[faces]
     weights = np.array([0.4, 0.35, 0.25])
     at = np.einsum("c,fck->fk", weights, corners)
-    read = of_facets(one.points, round).surface
+    read = lattice.facets(one.points).surface
     z, gx, gy = (t.numpy() for t in read.at(None, torch.from_numpy(at[:, 0].copy()), torch.from_numpy(at[:, 1].copy())))
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     inside = np.hypot(at[:, 0], at[:, 1]) < 4.4 if round else np.full(len(at), True)
@@ -285,8 +285,8 @@ def test_facets_are_those_of_the_mesh(round):
 
 
 def test_a_turned_facet_surface_is_the_half_turn():
-    scene, field, heights = make(control=(9, 8))
-    one = patch(scene.lens, field, heights, (14, 11))
+    _, field, heights = make(control=(9, 8))
+    one = LATTICES["rectangle"].patch(field, heights, (14, 11))
     read = FacetSurface(one.points, normals=one.normals)
     x, y = (torch.from_numpy(c) for c in np.random.default_rng(4).uniform(-3.0, 3.0, (2, 200)))
     for a, b, sign in zip(read.turned().at(None, x, y), read.at(None, x, -y), (-1, -1, 1), strict=True):
@@ -295,16 +295,16 @@ def test_a_turned_facet_surface_is_the_half_turn():
 
 def test_smoothed_normals_are_closer_than_facets():
     """Of a parabola: between points h apart a facet's slope is c h / sqrt(12) off in the mean, an interpolated normal hardly."""
-    scene, field, _ = make(control=(24, 24), size=(10.0, 10.0), degree=(2, 2))
+    _, field, _ = make(control=(24, 24), size=(10.0, 10.0), degree=(2, 2))
     x, y = field.control_xy()
     heights = field.interpolated(5.0 - 0.005 * (x[:, None] ** 2 + 0.0 * y[None, :]))
-    one, c, h = patch(scene.lens, field, heights, (51, 51)), 0.01, 10.0 / 50
+    one, c, h = LATTICES["rectangle"].patch(field, heights, (51, 51)), 0.01, 10.0 / 50
     px, py = (torch.from_numpy(v) for v in np.random.default_rng(6).uniform(-4.5, 4.5, (2, 20_000)))
     own = field.at(heights, px, py)[1]
-    flat = (of_facets(one.points, False).surface.at(None, px, py)[1] - own).square().mean().sqrt()
-    given = (of_facets(one.points, False, one.normals).surface.at(None, px, py)[1] - own).square().mean().sqrt()
+    flat = (LATTICES["rectangle"].facets(one.points).surface.at(None, px, py)[1] - own).square().mean().sqrt()
+    given = (LATTICES["rectangle"].facets(one.points, one.normals).surface.at(None, px, py)[1] - own).square().mean().sqrt()
     assert float(flat) == pytest.approx(c * h / 12**0.5, rel=0.02) and float(given) < 1e-3 * float(flat)
-    smooth = of_vertices(one.points, triangles(one.points), True)
+    smooth = LATTICES["circle"].smooth(one.points)
     assert smooth.read_as == "facets with smoothed normals"
 
 

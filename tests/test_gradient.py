@@ -19,7 +19,9 @@ from caustic_cli.optics.gradient import (
     Axial,
     FishEye,
     Luneburg,
+    NextSurface,
     Radial,
+    RayFlow,
     Selfoc,
     SplineIndex,
     flow,
@@ -27,10 +29,12 @@ from caustic_cli.optics.gradient import (
     transfer,
 )
 from caustic_cli.optics.gradient.integrator import WEIGHTS, drift, kick
+from caustic_cli.optics.gradient.medium import GradientMedium
+from caustic_cli.optics.media import Medium
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField, Plane
-from caustic_cli.optics.system import Element, Medium, System
+from caustic_cli.optics.system import Element, System
 from caustic_cli.optics.trace import Tracer, render
 from caustic_cli.scene import Aperture, PlaneWave, Points, Screen
 from caustic_cli.scene.gradient import Gradient
@@ -53,10 +57,15 @@ def volume(shape, seed: int = 0, half_size=(5.0, 5.0), depth: float = 4.0) -> Sp
     return SplineIndex(1.5 + 0.02 * torch.rand(shape, generator=generator, dtype=D), half_size, depth)
 
 
+def medium(index: float, absorption: float, field) -> Medium:
+    """Glass, with an index field or without."""
+    return Medium(index, absorption) if field is None else GradientMedium(index, absorption, gradient=field)
+
+
 def block(field, depth: float, index: float = 1.5, half: float = 5.0, absorption: float = 0.0) -> tuple[Element, Element]:
     """Both sides of a flat blank."""
     return (
-        Element("entrance", Plane(), Aperture((half, half)), behind=Medium(index, absorption, gradient=field)),
+        Element("entrance", Plane(), Aperture((half, half)), behind=medium(index, absorption, field)),
         Element("exit", Plane(), Aperture((half, half)), pose=Pose((0.0, 0.0, depth))),
     )
 
@@ -103,7 +112,7 @@ def test_maxwells_fish_eye_images_every_point():
     def seen(points, vectors):
         return (points[0], points[1], points[2] - 6.0), vectors
 
-    found = transfer(flow, field, None, (zero, zero, zero), d, Plane(), None, seen, 1.0)
+    found = transfer(RayFlow(flow, field, None), (zero, zero, zero), d, NextSurface(Plane(), None, seen, 1.0))
     assert bool(found.found.all()) and found.steps > 4
     assert max(float(c.abs().max()) for c in found.point[:2]) < 3e-6  # 1e-7 of ways of up to 15 mm
     assert (found.path / (0.5 * math.pi * 2.0 * 3.0) - 1.0).abs().max() < 1e-6
@@ -220,7 +229,7 @@ def test_what_is_no_field_is_refused():
     with pytest.raises(InputError, match=r"0\.5"):
         Selfoc(1.5, 0.3).extremes((4.0, 4.0), 1.0)
     with pytest.raises(InputError, match="in front of"):
-        System((PlaneWave(),), block(None, 4.0), before=Medium(1.5, gradient=Axial(1.5, (0.1,))))
+        System((PlaneWave(),), block(None, 4.0), before=GradientMedium(1.5, gradient=Axial(1.5, (0.1,))))
 
 
 def test_rays_that_do_not_converge_are_refused():
@@ -292,7 +301,7 @@ def bumpy(source, tilt=(0.0, 0.0)):
     """A B-spline volume behind a flat entrance, a free-form exit, absorption, and 900 rays."""
     field, space = volume((8, 8, 4), 1), SplineSpace.uniform(8, 3)
     elements = (
-        Element("entrance", Plane(), Aperture((5.0, 5.0)), behind=Medium(1.5, 0.01, gradient=field)),
+        Element("entrance", Plane(), Aperture((5.0, 5.0)), behind=GradientMedium(1.5, 0.01, gradient=field)),
         Element("exit", HeightField((space, space), (5.0, 5.0)), Aperture((5.0, 5.0)), pose=Pose(tilt=tilt)),
     )
     system = System((source,), elements, (Screen((14.0, 14.0), 100.0, (8, 8)),))
@@ -340,7 +349,7 @@ def test_a_volume_of_one_index_is_glass(fresnel):
     system, _, heights, _ = bumpy(Points(((0.5, 0.3, -40.0),)), (2.0, -1.0))
     made = []
     for gradient in (None, SplineIndex(torch.full((5, 5, 4), 1.5, dtype=D), (5.0, 5.0), 4.0)):
-        behind = Medium(1.5, 0.01, gradient=gradient)
+        behind = medium(1.5, 0.01, gradient)
         first = Element("entrance", Plane(), Aperture((5.0, 5.0)), behind=behind, fresnel=fresnel)
         last = Element("exit", system.elements[1].surface, Aperture((5.0, 5.0)), pose=Pose(tilt=(2.0, -1.0)), fresnel=fresnel)
         (image,) = render(System(system.sources, (first, last), system.screens), {"exit": heights}, 3000)
@@ -354,7 +363,7 @@ def test_a_wavelength_scales_the_field():
     glass = "N-BK7"
     index = Medium(1.5, glass=glass).index_at(587.5618)
     _, back = block(None, 10.0)
-    behind = Medium(index, glass=glass, gradient=Radial(index, (-2e-3,)))
+    behind = GradientMedium(index, glass=glass, gradient=Radial(index, (-2e-3,)))
     elements = (Element("entrance", Plane(), Aperture((5.0, 5.0)), behind=behind), back)
     system = System((PlaneWave(),), elements, (Screen((9.0, 9.0), 12.0),))
     x, zero = real([1.0, 3.0], 0.0)

@@ -105,7 +105,7 @@ def test_a_unit_of_power_is_watts_or_lumens():
     with pytest.raises(InputError, match=r"\[source\] power_unit must be one of W, lm, got 'cd'"):
         Light(unit="cd")
     old = complete({"source": {"power": 3.0}}, 1.0)
-    assert "power_unit" not in old["source"] and settings.build_light(old).unit == "W"
+    assert "power_unit" not in old.source and settings.build_light(old).unit == "W"
     said = settings.dump(complete({"source": {"power": 3.0, "power_unit": "lm"}}, 1.0))
     assert settings.build_light(complete(settings.parse(said, "here"), 1.0)).unit == "lm"
     with pytest.raises(InputError, match="power_unit must be text"):

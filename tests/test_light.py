@@ -118,7 +118,7 @@ def test_light_that_comes_through_the_sides_does_not_count():
     power = light.sum() * 0.25**2
     flat = torch.full((80, 80), 6.0, dtype=torch.float64)
     rays = expose(scene, HeightField.of(scene.lens), flat, rays_of(scene, "stratified", 400_000))
-    cone = scene.source.cone_over(scene.lens.half_size, 0.0)
+    cone = scene.source.cone_over(scene.lens.pupil)
     per_angle = 1.0 / (4.0 * math.pi * math.sin(cone / 2.0) ** 2)
     lost = rays.lost
     met = 1.0 - lost["missed_lens"] - lost["missed_surface"]

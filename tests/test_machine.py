@@ -157,7 +157,7 @@ def test_scallops_are_as_high_as_asked(tmp_path, path, shape):
     for bend in (0.0, 0.01, -0.01):
         scene, field, heights = spline(lambda x, y, b=bend: 4.0 + b * (x * x + y * y), size=(6.0, 6.0), aperture=shape)
         found = write_gcode(tmp_path / "a.nc", part_of("gcode", scene, field, heights), Milling(scallop=0.005, path=path))
-        f = form_deviation(cut_surface(tmp_path / "a.nc", scene, field), field, heights, shape == "circle")
+        f = form_deviation(cut_surface(tmp_path / "a.nc", scene, field), field, heights, scene.lens.opening)
         high, corners = found["scallop_mm"], 1.4 if path == "spiral" else 1.005
         assert high <= 0.005 * (1 + 1e-9) and f["cut_left_mm"] < high * corners and f["cut_gouge_mm"] < 2.0 * found["tolerance_mm"]
         if bend >= 0.0:
@@ -172,7 +172,7 @@ def test_a_cut_converges_to_the_design(tmp_path):
     left, slopes, heights = [], [], (8e-3, 2e-3, 5e-4)
     for h in heights:
         write_gcode(tmp_path / "a.nc", part_of("gcode", *lens), Milling(scallop=h, tool_radius=1.0), tolerance=0.05 * h)
-        f = form_deviation(cut_surface(tmp_path / "a.nc", *lens[:2]), *lens[1:], False)
+        f = form_deviation(cut_surface(tmp_path / "a.nc", *lens[:2]), *lens[1:], lens[0].lens.opening)
         left.append(f["cut_rms_mm"])
         slopes.append(f["cut_slope_rms"])
     assert 0.9 < np.polyfit(np.log(heights), np.log(left), 1)[0] < 1.1

@@ -24,7 +24,8 @@ from caustic_cli.optics.emission.measured import coarse_words, coarseness, irrad
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.optics.waves import NoWaveImage, wave_image
+from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
@@ -199,7 +200,7 @@ def test_rays_that_converge_have_no_first_surface_but_an_image():
         (lambda: measured(RaySet(np.zeros((1, 3)), [[0, 0, -1]], [1])), "no ray that carries light towards"),
         (lambda: measured(KNOWN["point"][0], power=0.0), "power"),
         (lambda: rays_of(scene(measured(KNOWN["point"][0])), "halton", 9), "sampler"),
-        (lambda: settings.build_source(complete({"source": {"type": "rays"}}, 1.0)), "must be a ray file"),
+        (lambda: settings.build_source(complete({"source": {"type": "rays"}}, 1.0).source), "must be a ray file"),
     ],
 )
 def test_impossible_ones_are_refused(what, message):
@@ -246,7 +247,7 @@ def test_a_design_from_a_file_stands_alone(here, capfd, form, name):
     assert figures["rays"] < 30_000 and "the ray file is coarse for 24 x 24 pixels: its 30,000 rays" in err
     project = workflow.Project.open("blob.caustic")
     kept = f"source{Path(name).suffix.lower()}"
-    assert project.settings["source"]["file"] == kept and project.settings["source"]["position"] == [[0, 0, -40]]
+    assert project.settings.source.file == kept and project.settings.source.position == ((0, 0, -40),)
     assert Path("blob.caustic", kept).read_bytes() == Path(name).read_bytes()
     history = project.load().state.history
     assert history[-1][2] < history[0][2]

@@ -13,7 +13,7 @@ from caustic_cli import cli, load
 from caustic_cli.errors import InputError
 from caustic_cli.optics.obstruction import RAYS, LightPath, clear_shift, refuse_obstructed
 from caustic_cli.project.project import Project
-from caustic_cli.scene import Component, Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Component, Disc, FoldMirror, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.screen import Sags
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
@@ -92,8 +92,8 @@ def test_a_source_stands_in_the_light_that_comes_back_and_in_that_of_another():
     assert found(Several((led, replace(led, power=2.0))), replace(WALL, shift=(0.0, 400.0))) is None  # both in one place
 
 
-def mirror(z: float, tilt: float, size: float = 40.0) -> Component:
-    return Component("mirror", z, (size, size), tilt=(tilt, 0.0))
+def mirror(z: float, tilt: float, size: float = 40.0) -> FoldMirror:
+    return FoldMirror(z, (size, size), tilt=(tilt, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -103,14 +103,14 @@ def mirror(z: float, tilt: float, size: float = 40.0) -> Component:
         ((mirror(100.0, 45.0), mirror(200.0, 45.0)), None),  # back, 100 mm above
         ((mirror(100.0, 5.0),), ("the free-form lens", "the mirror of [[element]] 1", "the screen")),
         (
-            (mirror(100.0, 45.0), mirror(108.0, 45.0, 12.0), Component("lens", 150.0, (20.0, 20.0))),
+            (mirror(100.0, 45.0), mirror(108.0, 45.0, 12.0), Component(150.0, (20.0, 20.0))),
             ("the lens of [[element]] 3", "the free-form lens", "the mirror of [[element]] 1"),
         ),
         (
-            (mirror(100.0, 45.0), mirror(108.0, 45.0, 12.0), Component("lens", 250.0, (20.0, 20.0), aperture="circle")),
+            (mirror(100.0, 45.0), mirror(108.0, 45.0, 12.0), Component(250.0, (20.0, 20.0), aperture="circle")),
             ("the lens of [[element]] 3", "the source", "the free-form lens"),
         ),
-        ((Component("lens", -30.0, (12.0, 12.0)), mirror(100.0, -45.0)), None),
+        ((Component(-30.0, (12.0, 12.0)), mirror(100.0, -45.0)), None),
     ],
 )
 def test_axes_that_are_folded_back(elements, bodies):
@@ -144,7 +144,7 @@ def test_the_screen_of_a_folded_axis_in_the_light_of_the_source():
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (60.0, 0.0)])
 def test_a_screen_behind_a_lens_is_in_no_light(source, tilt):
     for screen in (Screen((400.0, 400.0), 300.0, tilt=tilt), Screen((100.0, 100.0), 100.0, tilt=tilt, shift=(20.0, -300.0))):
-        for elements in ((), (Component("lens", 20.0, (20.0, 20.0)),)):
+        for elements in ((), (Component(20.0, (20.0, 20.0)),)):
             assert found(source, screen, LENS, *elements) is None
 
 
@@ -188,7 +188,7 @@ def test_a_mirror_throws_its_picture_beside_the_light_on_it(capfd):
     out, err = run(capfd, "design", "blob.png", "--preset", "mirror-100", *SMALL, "--json")
     assert "the screen is shifted by 0,250 mm" in err and json.loads(out)["on_screen"] > 0.9
     project = Project.open("blob.caustic")
-    assert project.settings["screen"]["shift"] == [0.0, 250.0] and found(SUN, project.scene().screen) is None
+    assert project.settings.screen.shift == (0.0, 250.0) and found(SUN, project.scene().screen) is None
     run(capfd, "render", "blob.caustic", "--rays", "1e4")
     run(capfd, "export", "blob.caustic", "--format", "lighttools", "-o", "blob.npz")
     for source in ("blob.caustic", "blob.npz"):

@@ -67,7 +67,7 @@ def designer(over: Ranges = THROWS, source: dict | None = None, **options) -> De
     }
     full = complete(given | ({"source": source} if source else {}), 1.0)
     scene = build_scene(full)
-    target = torch.from_numpy(comparison.disc(scene, tuple(full["target"]["size"])))
+    target = torch.from_numpy(comparison.disc(scene, full.target.size))
     own = build_options(full)
     own = replace(own, parametrisation=replace(own.parametrisation, **options))
     return Designer(NetworkOverRange(scene, target, build_stages(full), own, ranges=over))
@@ -294,7 +294,7 @@ def test_source_places_take_their_middle_and_may_be_said_so(capfd):
         },
         1.0,
     )
-    assert made["design"]["preconditioner"] == "laplacian" and "network_width" not in made["design"]
+    assert made.design.preconditioner == "laplacian" and "network_width" not in made.design
 
 
 REFUSED = {
@@ -346,9 +346,9 @@ def test_contradictions_of_networks_are_refused():
         build_options(complete(complete_options, 1.0))
     with pytest.raises(InputError, match="network_layers must be a whole number 1 to 16"):
         Architecture(0)
-    counted = complete({"design": {"network": "dense", "optimizer": "adam", "preconditioner": "laplacian"}}, 1.0)["design"]
-    assert (counted["initial"], counted["start"]) == ("zero-last", "transport")
-    assert complete({}, 1.0)["design"]["initial"] == "zero"
+    counted = complete({"design": {"network": "dense", "optimizer": "adam", "preconditioner": "laplacian"}}, 1.0).design
+    assert (counted.initial, counted.start) == ("zero-last", "transport")
+    assert complete({}, 1.0).design.initial == "zero"
     with pytest.raises(InputError, match="start only with"):
         complete({"design": {"network": "dense", "optimizer": "adam", "start": "transport"}}, 1.0)
 

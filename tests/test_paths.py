@@ -11,11 +11,13 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.effects import Requests
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.gradient.fields import SplineIndex
+from caustic_cli.optics.gradient.medium import GradientMedium, index_name
+from caustic_cli.optics.media import Medium
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces import HeightField, Plane, Sphere
-from caustic_cli.optics.system import Element, Medium, System
-from caustic_cli.optics.trace import Tracer, index_name, render, trace
-from caustic_cli.scene import Aperture, PlaneWave, Points, Screen
+from caustic_cli.optics.system import Element, System
+from caustic_cli.optics.trace import Tracer, render, trace
+from caustic_cli.scene import Aperture, CircularAperture, PlaneWave, Points, Screen
 
 GLASS, FLAT = Medium(1.5), Aperture((5.0, 5.0))
 FIELD = HeightField((SplineSpace.uniform(8, 3), SplineSpace.uniform(7, 2)), (5.0, 5.0))
@@ -46,7 +48,7 @@ ODD = {
     "one side alone": (FAR, (front(Plane()),), 0.96),
     "a round exit": (
         FAR,
-        (front(Plane(), fresnel="none"), back(aperture=Aperture((5.0, 5.0), True), fresnel="none")),
+        (front(Plane(), fresnel="none"), back(aperture=CircularAperture((5.0, 5.0)), fresnel="none")),
         math.pi / 4.0,
     ),
     "a small exit": (FAR, (front(Plane(), fresnel="none"), back(aperture=Aperture((2.0, 2.0)), fresnel="none")), 0.16),
@@ -92,7 +94,7 @@ def test_steps_through_glass_follow_its_index():
     """A tracer that was called with an even index takes as many steps through an uneven one as a new tracer does."""
     even = torch.full((8, 8, 1), 1.5, dtype=torch.float64)
     uneven = even + 0.05 * torch.rand(8, 8, 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    medium = Medium(1.5, gradient=SplineIndex(even, (5.0, 5.0), 5.0))
+    medium = GradientMedium(1.5, gradient=SplineIndex(even, (5.0, 5.0), 5.0))
     elements = (front(Plane(), z=0.0, behind=medium), Element("last", Plane(), FLAT, pose=Pose((0.0, 0.0, 5.0))))
     system, rays = System((PlaneWave(),), elements, (SCREEN,)), next(iter(Sampler("stratified", (20, 20), 1).chunks()))
     name, kept = index_name(elements[0]), Tracer(system, rays)

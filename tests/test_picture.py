@@ -221,7 +221,7 @@ def test_write_then_read_is_lossless(values, encoding):
     before = Picture(values, encoding)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"target{before.suffix}"
-        before.write(path)
+        files.write_bytes(path, before.encoded())
         after = read_picture(path, linear=encoding == "linear")
         assert files.is_ours(path)
         assert [p.name for p in Path(folder).iterdir()] == [path.name]

@@ -80,12 +80,12 @@ def test_no_ray_breaks_a_proof(source, bumps):
         assert traced.first == len(traced.system.elements) - 1
         interaction = traced.trace_element(traced.first, traced.start, heights)
         alive = interaction.state.power > 0
-        o, d = ([c[alive] for c in interaction.state.full(v)] for v in (interaction.local, interaction.state.direction))
+        o, d = ([c[alive] for c in interaction.state.full(v)] for v in (interaction.hit.local, interaction.state.direction))
         if not plan["secondary-intersection"].on:
             _, found = next_intersection(field, heights, o, d, below=False)
             assert not bool(found.any())
             leaning = torch.hypot(d[0], d[1]) / d[2]
-            assert bounds.slope * float(leaning.max()) <= bounds.slope_ratio * (1 + 1e-12)
+            assert bounds.exit.slope * float(leaning.max()) <= bounds.exit.slope_ratio * (1 + 1e-12)
             proven += 1
     assert proven >= (8 if bumps < 0.1 else 4 if source is None else 0)
 

@@ -13,7 +13,8 @@ from PIL import Image, ImageDraw
 
 from caustic_cli import cli, design
 from caustic_cli.config import presets, settings
-from caustic_cli.config.completion import Derivation, complete
+from caustic_cli.config.completion import complete
+from caustic_cli.config.table import Parameters
 from caustic_cli.errors import InputError
 from caustic_cli.project.project import Project
 from caustic_cli.scene.materials import MATERIALS
@@ -30,9 +31,9 @@ def _quick(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", presets.names())
 def test_every_preset_is_a_whole_scene(name):
     said = settings.read(presets.path_of(name), parameters=True)
-    full = complete(said, 1.0, Derivation(**said.pop("")))
+    full = complete(said, 1.0, Parameters(**said.pop("")))
     scene = settings.build_scene(full)
-    assert scene.screen.z == full["screen"]["z"] and dict(presets.rows())[name].endswith(".")
+    assert scene.screen.z == full.screen.z and dict(presets.rows())[name].endswith(".")
 
 
 def test_a_preset_gives_way_to_a_configuration_and_both_to_options(capfd):
@@ -41,9 +42,9 @@ def test_a_preset_gives_way_to_a_configuration_and_both_to_options(capfd):
     given = ["--preset", "plate-100", "--config", "more.toml", "--throw", "80cm"]
     assert cli.run(["design", "blob.png", *given, *SMALL]) == 0
     s = Project.open("blob.caustic").settings
-    assert s["lens"]["size"] == [100.0, 100.0] and s["source"]["angle"] == 0.533  # the preset's
-    assert s["target"]["size"][0] == 250.0 and s["lens"]["index"] == 1.6 and "glass" not in s["lens"]  # the configuration's
-    assert s["screen"]["z"] == 800.0  # the option's
+    assert s.lens.size == (100.0, 100.0) and s.source.angle == 0.533  # the preset's
+    assert s.target.size[0] == 250.0 and s.lens.index == 1.6 and "glass" not in s.lens  # the configuration's
+    assert s.screen.z == 800.0  # the option's
     assert cli.run(["design", "--resume", "blob.caustic", "--preset", "thesis"]) == 2
     assert "--preset cannot be given" in capfd.readouterr().err
     assert cli.run(["design", "blob.png", "--preset", "plate100"]) == 2

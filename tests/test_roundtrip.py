@@ -663,6 +663,6 @@ def test_mitsuba_files_of_any_name_are_xml(tmp_path, name):
 def test_an_archive_stands_where_its_lens_did(tmp_path):
     """Another lens right behind a thin one is behind it."""
     scene, field, heights = make()
-    thin = replace(scene, lens=replace(scene.lens, offset=Offset(1.0)), elements=(Component("lens", 3.0, (10.0, 10.0), 1.0),))
+    thin = replace(scene, lens=replace(scene.lens, offset=Offset(1.0)), elements=(Component(3.0, (10.0, 10.0), 1.0),))
     write_lighttools(tmp_path / "lens.npz", thin, field, heights - heights.mean() + 1.0)
     assert open_archive(tmp_path / "lens.npz")[0].lens.offset.thickness == pytest.approx(1.0, abs=0.3)

@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import Derivation, complete
+from caustic_cli.config.completion import complete
 from caustic_cli.config.default_stages import GAPS, transport_cells
 from caustic_cli.config.design import build_options, build_stages
-from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, build_lens, build_scene, dump, parse
+from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, Settings, build_lens, build_scene, dump, parse, tables_of
+from caustic_cli.config.table import Parameters
 from caustic_cli.errors import InputError
 
 INDEX = 1.5443  # table D.2
@@ -52,21 +53,23 @@ def written(draw):
 
 @given(written())
 def test_parse_undoes_dump(s):
-    assert parse(dump(s), "here") == s
+    full = Settings.of(s)
+    assert parse(dump(full), "here") == tables_of(full)
 
 
 @given(written())
 def test_dump_is_toml_any_reader_reads(s):
-    raw = tomllib.loads(dump(s))
+    full = Settings.of(s)
+    raw = tomllib.loads(dump(full))
     assert raw.pop("format_version") == 1
     assert raw.pop("created_by").startswith("caustic ")
-    assert raw == s | ({"element": s["element"]["list"]} if "element" in s else {})
+    assert raw == tables_of(full) | ({"element": s["element"]["list"]} if "element" in s else {})
 
 
 def test_complete_settings_round_trip():
     s = complete({}, 0.75)
-    assert parse(dump(s), "here") == s
-    assert dump(parse(dump(s), "here")) == dump(s)
+    assert parse(dump(s), "here") == tables_of(s)
+    assert dump(complete(parse(dump(s), "here"), 0.75)) == dump(s)
 
 
 def test_every_length_carries_its_unit():
@@ -136,67 +139,67 @@ def test_a_file_that_is_no_text(tmp_path):
 
 def test_the_default_scene_is_table_d2():
     s = complete({}, 1.0)
-    assert s["lens"]["size"] == [10.0, 10.0] and s["screen"]["z"] == 300.0 and s["lens"]["index"] == INDEX
-    assert s["target"]["size"] == pytest.approx([30.0, 30.0])
-    assert s["screen"]["size"] == pytest.approx([38.4, 38.4])
-    assert s["screen"]["resolution"] == [250, 250]
-    assert s["lens"]["control"] == [503, 503] and s["lens"]["degree"] == [3, 3]
+    assert s.lens.size == (10.0, 10.0) and s.screen.z == 300.0 and s.lens.index == INDEX
+    assert s.target.size == pytest.approx([30.0, 30.0])
+    assert s.screen.size == pytest.approx([38.4, 38.4])
+    assert s.screen.resolution == (250, 250)
+    assert s.lens.control == (503, 503) and s.lens.degree == (3, 3)
     build_scene(s), build_stages(s), build_options(s)
 
 
 def test_mag_3():
-    s = complete({}, 1.0, Derivation(mag=3.0))
-    assert s["target"]["size"] == pytest.approx([30.0, 30.0]) and s["screen"]["size"] == pytest.approx([38.4, 38.4])
-    assert s["lens"]["radius"] == pytest.approx([(INDEX - 1) * (300 - 5) / 2] * 2, rel=1e-14)
-    assert build_lens(s).offset.radius == tuple(s["lens"]["radius"])
+    s = complete({}, 1.0, Parameters(mag=3.0))
+    assert s.target.size == pytest.approx([30.0, 30.0]) and s.screen.size == pytest.approx([38.4, 38.4])
+    assert s.lens.radius == pytest.approx([(INDEX - 1) * (300 - 5) / 2] * 2, rel=1e-14)
+    assert build_lens(s.lens).offset.radius == s.lens.radius
 
 
 def test_mag_1_is_flat():
-    assert complete({}, 1.0, Derivation(mag=1.0))["lens"]["radius"] == [math.inf, math.inf]
+    assert complete({}, 1.0, Parameters(mag=1.0)).lens.radius == (math.inf, math.inf)
 
 
 def test_mag_counts_lens_widths():
-    s = complete({"lens": {"size": [20.0, 20.0]}}, 1.0, Derivation(mag=2.0, margin=0.5))
-    assert s["target"]["size"] == pytest.approx([40.0, 40.0]) and s["screen"]["size"] == pytest.approx([60.0, 60.0])
+    s = complete({"lens": {"size": [20.0, 20.0]}}, 1.0, Parameters(mag=2.0, margin=0.5))
+    assert s.target.size == pytest.approx([40.0, 40.0]) and s.screen.size == pytest.approx([60.0, 60.0])
 
 
 @pytest.mark.parametrize(("at", "thickness"), [(-10.0, 11.607), (-60.0, 6.0)])
 def test_a_lens_close_to_its_source_is_thick_enough_for_its_corners(at, thickness):
     """A source 10 mm before a lens of 30 mm: the offset gathers 56 degrees, and its corners lie 10.6 mm below its middle."""
     said = {"source": {"type": "point", "position": [[0.0, 0.0, at]]}, "lens": {"size": [30.0, 30.0]}}
-    s = complete(said, 1.0, Derivation(mag=3.0))
-    low, _ = build_lens(s).height_bounds(np.array([-15.0, 0.0, 15.0]), np.array([-15.0, 0.0, 15.0]))
-    assert low.min() >= 1.0 and s["lens"]["thickness"] == pytest.approx(thickness, abs=1e-3)
+    s = complete(said, 1.0, Parameters(mag=3.0))
+    low, _ = build_lens(s.lens).height_bounds(np.array([-15.0, 0.0, 15.0]), np.array([-15.0, 0.0, 15.0]))
+    assert low.min() >= 1.0 and s.lens.thickness == pytest.approx(thickness, abs=1e-3)
     with pytest.raises(InputError, match="leaves no room for the heights"):
-        thin = complete({**said, "lens": said["lens"] | {"thickness": 0.9}}, 1.0, Derivation(mag=3.0))
-        build_lens(thin).height_bounds(np.array([-15.0, 0.0, 15.0]), np.array([-15.0, 0.0, 15.0]))
+        thin = complete({**said, "lens": said["lens"] | {"thickness": 0.9}}, 1.0, Parameters(mag=3.0))
+        build_lens(thin.lens).height_bounds(np.array([-15.0, 0.0, 15.0]), np.array([-15.0, 0.0, 15.0]))
 
 
 def test_a_non_square_picture_keeps_its_shape():
-    s = complete({}, 0.5, Derivation(mag=3.0))
-    assert s["target"]["size"] == pytest.approx([30.0, 15.0])
-    assert s["screen"]["size"] == pytest.approx([38.4, 19.2])
-    assert s["screen"]["resolution"] == [250, 125]
+    s = complete({}, 0.5, Parameters(mag=3.0))
+    assert s.target.size == pytest.approx([30.0, 15.0])
+    assert s.screen.size == pytest.approx([38.4, 19.2])
+    assert s.screen.resolution == (250, 125)
     reach = (INDEX - 1) * 295  # each axis has its own magnification, 3 and 1.5
-    assert s["lens"]["radius"] == pytest.approx([reach / 2, reach / 0.5])
+    assert s.lens.radius == pytest.approx([reach / 2, reach / 0.5])
 
 
 @pytest.mark.parametrize(
-    ("width", "aspect", "expected"), [(24, 1.0, [24, 24]), (100, 2.0, [100, 200]), (100, 0.753, [100, 75]), (2, 0.01, [2, 2])]
+    ("width", "aspect", "expected"), [(24, 1.0, (24, 24)), (100, 2.0, (100, 200)), (100, 0.753, (100, 75)), (2, 0.01, (2, 2))]
 )
 def test_resolution_counts_across(width, aspect, expected):
-    assert complete({}, aspect, Derivation(resolution=(width,)))["screen"]["resolution"] == expected
+    assert complete({}, aspect, Parameters(resolution=(width,))).screen.resolution == expected
 
 
 def test_screen_size_alone_sets_the_picture():
     s = complete({"screen": {"size": [64.0, 64.0]}}, 1.0)
-    assert s["target"]["size"] == pytest.approx([50.0, 50.0])
+    assert s.target.size == pytest.approx([50.0, 50.0])
 
 
 def test_a_picture_fits_on_a_screen_of_another_shape():
     for aspect in (0.5, 1.0, 3.0):
         s = complete({"screen": {"size": [64.0, 32.0]}}, aspect)
-        width, height = s["target"]["size"]
+        width, height = s.target.size
         assert height == pytest.approx(aspect * width)
         assert width <= 50.0 + 1e-9 and height <= 25.0 + 1e-9
         assert width == pytest.approx(50.0) or height == pytest.approx(25.0)
@@ -205,13 +208,13 @@ def test_a_picture_fits_on_a_screen_of_another_shape():
 def test_what_was_given_is_kept():
     given_ = {"lens": {"radius": [100.0, 90.0], "control": [20, 21], "degree": [2, 5]}, "screen": {"resolution": [7, 9]}}
     s = complete(given_, 1.0)
-    assert s["lens"]["radius"] == [100.0, 90.0] and s["lens"]["control"] == [20, 21] and s["screen"]["resolution"] == [7, 9]
+    assert s.lens.radius == (100.0, 90.0) and s.lens.control == (20, 21) and s.screen.resolution == (7, 9)
 
 
 def test_glass_replaces_the_index():
     s = complete({"lens": {"glass": "N-BK7"}}, 1.0)
-    assert "index" not in s["lens"]
-    assert build_lens(s).index == pytest.approx(1.5168, abs=1e-4)  # n_d of the Schott catalogue
+    assert "index" not in s.lens
+    assert build_lens(s.lens).index == pytest.approx(1.5168, abs=1e-4)  # n_d of the Schott catalogue
     with pytest.raises(InputError, match="not both"):
         complete({"lens": {"glass": "N-BK7", "index": 1.5}}, 1.0)
 
@@ -222,15 +225,15 @@ RAYS = {"design": {"waves": "off"}}
 
 @pytest.mark.parametrize(("quality", "first", "last"), [("draft", 15, 25), ("standard", 25, 50), ("fine", 40, 120)])
 def test_quality_shapes_the_stages(quality, first, last):
-    stages = complete(OFFSET, 1.0, Derivation(quality=quality))["design"]["stages"]
-    assert stages[0]["iterations"] == first and stages[-1]["iterations"] == last
-    moved = [complete(RAYS, 1.0, Derivation(quality=q))["design"]["stages"] for q in ("draft", "standard", "fine")]
+    stages = complete(OFFSET, 1.0, Parameters(quality=quality)).design.stages
+    assert stages[0].iterations == first and stages[-1].iterations == last
+    moved = [complete(RAYS, 1.0, Parameters(quality=q)).design.stages for q in ("draft", "standard", "fine")]
     assert [len(s) for s in moved] == [1, 2, 3]
-    assert [s[-1]["control"][0] for s in moved] == sorted(s[-1]["control"][0] for s in moved)
+    assert [s[-1].control[0] for s in moved] == sorted(s[-1].control[0] for s in moved)
 
 
 def test_stages_end_sharp_on_the_lens_own_net():
-    s = complete({"lens": {"control": [19, 35]}, **OFFSET}, 1.0, Derivation(rays=5000))
+    s = complete({"lens": {"control": [19, 35]}, **OFFSET}, 1.0, Parameters(rays=5000))
     stages = build_stages(s)
     assert stages[-1].control == (19, 35) and stages[-1].rays == 5000 and stages[-1].blur == 0.0
     blurs = [stage.rendering.blur for stage in stages]
@@ -239,7 +242,7 @@ def test_stages_end_sharp_on_the_lens_own_net():
 
 @pytest.mark.parametrize("design", [{"network": "dense", "optimizer": "adam"}, {"optimizer": "adam"}])
 def test_adam_has_one_stage(design):
-    assert len(complete({"design": design}, 1.0)["design"]["stages"]) == 1
+    assert len(complete({"design": design}, 1.0).design.stages) == 1
 
 
 @pytest.mark.parametrize(
@@ -262,7 +265,7 @@ def test_adam_has_one_stage(design):
 )
 def test_out_of_range(given_, shaped, word):
     with pytest.raises(InputError) as caught:
-        complete(given_, 1.0, Derivation(**shaped))
+        complete(given_, 1.0, Parameters(**shaped))
     assert word in str(caught.value)
 
 
@@ -292,15 +295,15 @@ def test_design_options_out_of_range(key, value):
 def test_a_picture_with_gaps_has_a_net_as_fine_as_its_creases_ask_for():
     rays = {"design": {"waves": "off"}}
     plain, creased = complete(rays, 1.0), complete(rays, 1.0, gaps=1.0)
-    assert plain["lens"]["control"] == [503, 503]
-    assert creased["lens"]["control"] == [3003, 3003] == creased["design"]["stages"][-1]["control"]
-    assert complete(rays, 1.0, gaps=0.9 * GAPS)["design"] == plain["design"]
+    assert plain.lens.control == (503, 503)
+    assert creased.lens.control == (3003, 3003) == creased.design.stages[-1].control
+    assert complete(rays, 1.0, gaps=0.9 * GAPS).design == plain.design
     own = {**rays, "lens": {"control": [203, 203]}}
-    assert complete(own, 1.0, gaps=1.0)["design"]["stages"] == complete(own, 1.0)["design"]["stages"]
+    assert complete(own, 1.0, gaps=1.0).design.stages == complete(own, 1.0).design.stages
     blurred = {**rays, "source": {"type": "disc", "position": [[0.0, 0.0, -1000.0]]}}
     tilted = {**rays, "screen": {"tilt": [0.0, 30.0]}}  # whose pixels are not those of the map
     for other in ({}, blurred, tilted):  # the first is seen as a wave
-        assert complete(other, 1.0, gaps=1.0)["lens"]["control"] == complete(other, 1.0)["lens"]["control"]
+        assert complete(other, 1.0, gaps=1.0).lens.control == complete(other, 1.0).lens.control
 
 
 def test_cells_of_the_start_follow_rays_or_a_fine_net():

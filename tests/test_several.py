@@ -24,7 +24,7 @@ from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import lines_of, wave_image
-from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Aperture, Disc, Lens, Light, PlaneWave, Points, Pupil, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
@@ -39,6 +39,7 @@ MEMBERS = (
     Disc(angle=1.0, power=0.25),
 )
 NONE = ((), ())
+PUPIL = Pupil(Aperture((5.0, 4.0)), 0.0)
 GLASS = Lens(size=(10.0, 8.0), control=(8, 7), glass="N-BK7", index=1.5168)
 
 
@@ -48,13 +49,13 @@ def test_what_they_say_together():
     assert some.fractions == pytest.approx((0.8, 0.2)) and some.nearest == -20.0 and some.extent == (1.0, 0.5)
     assert some.centre == pytest.approx((0.4, 0.2, -22.0)) and sum(some.powers) == pytest.approx(2.5)
     assert some.blur(0.0, 100.0) == MEMBERS[2].blur(0.0, 100.0) and some.pointlike().extent == (0.0, 0.0)
-    assert some.cone_over((5, 4), 0.0) == max(m.cone_over((5, 4), 0.0) for m in some.members)
+    assert some.cone_over(PUPIL) == max(m.cone_over(PUPIL) for m in some.members)
     far = Several((MEMBERS[0], MEMBERS[4]), (NONE,) * 2)
     assert far.distant and not far.collimated and far.nearest == -math.inf and len(far.points()[0]) == 0
-    assert far.half_angle == pytest.approx(math.radians(0.5)) and far.incidence((5, 4), 0.0) == far.half_angle
+    assert far.half_angle == pytest.approx(math.radians(0.5)) and far.incidence(PUPIL) == far.half_angle
     mixed = Several(MEMBERS, (NONE,) * 5)
-    assert not mixed.distant and mixed.cone_over((5, 4), 0.0) == math.pi / 2 and mixed.extent_words(0.0)
-    assert mixed.incidence((5, 4), 0.0) == max(m.incidence((5, 4), 0.0) for m in MEMBERS)
+    assert not mixed.distant and mixed.cone_over(PUPIL) == math.pi / 2 and mixed.extent_words(0.0)
+    assert mixed.incidence(PUPIL) == max(m.incidence(PUPIL) for m in MEMBERS)
     same = Several((Points(((0.0, 0.0, -20.0),)),) * 3, (NONE,) * 3)
     assert not same.apart and same.sharp and not same.extended
 
@@ -134,13 +135,13 @@ def test_settings_go_round():
     full = complete(settings.parse(text, "a"), 1.0)
     assert settings.dump(full).count("[[source]]") == 2
     again = settings.parse(settings.dump(full), "b")
-    assert again["source"] == {k: v for k, v in full["source"].items()}
-    source, light = settings.build_source(full), settings.build_light(full)
+    assert again == settings.tables_of(full)
+    source, light = settings.build_source(full.source), settings.build_light(full)
     assert [m.kind for m in source.members] == ["point", "disc"] and source.fractions == (0.75, 0.25)
     assert light.wavelengths == (620.0, 450.0, 500.0) and light.parts == pytest.approx((0.75, 0.125, 0.125))
-    assert full["design"]["start"] == "transport"  # both stand in the same place
+    assert full.design.start == "transport"  # both stand in the same place
     one = complete(settings.parse("[[source]]\ntype = 'point'\n", "a"), 1.0)
-    assert len(settings.build_source(one).members) == 1 and "[source]" in settings.dump(one)
+    assert len(settings.build_source(one.source).members) == 1 and "[source]" in settings.dump(one)
 
 
 def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):

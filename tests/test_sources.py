@@ -22,7 +22,20 @@ from caustic_cli.optics.emission.near import Near
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen, Source, sources
+from caustic_cli.scene import (
+    Aperture,
+    CircularAperture,
+    Disc,
+    Lens,
+    Offset,
+    PlaneWave,
+    Points,
+    Pupil,
+    Scene,
+    Screen,
+    Source,
+    sources,
+)
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.section import SourceType
 from caustic_cli.scene.sources.several import Several
@@ -103,21 +116,21 @@ def farthest(x: float, y: float) -> float:
 def test_the_cone_over_a_lens(name, tangent, round_):
     """Half size 5 x 4; round, of radius 5."""
     s = FACTS[name][0]
-    assert math.tan(s.cone_over((5.0, 4.0), 0.0)) == pytest.approx(tangent, rel=1e-8)
-    assert math.tan(s.cone_over((5.0, 5.0), 0.0, True)) == pytest.approx(round_, rel=1e-8)
-    assert Disc(cone=30.0).cone_over((5.0, 4.0), 0.0) == pytest.approx(math.pi / 6)
+    assert math.tan(s.cone_over(Pupil(Aperture((5.0, 4.0)), 0.0))) == pytest.approx(tangent, rel=1e-8)
+    assert math.tan(s.cone_over(Pupil(CircularAperture((5.0, 5.0)), 0.0))) == pytest.approx(round_, rel=1e-8)
+    assert Disc(cone=30.0).cone_over(Pupil(Aperture((5.0, 4.0)), 0.0)) == pytest.approx(math.pi / 6)
 
 
 def test_the_cone_of_a_disc_is_the_narrowest_that_covers_the_lens():
     """The LED of the preset: 1 mm across, 60 mm before a lens of 30 x 30 mm, half the diagonal of both together."""
     led = Disc((0.0, 0.0, -60.0), (1.0, 1.0))
-    assert math.degrees(led.cone_over((15.0, 15.0), 0.0)) == pytest.approx(19.894, abs=1e-3)
+    assert math.degrees(led.cone_over(Pupil(Aperture((15.0, 15.0)), 0.0))) == pytest.approx(19.894, abs=1e-3)
     cross = np.zeros((5, 5))
     cross[2, :] = cross[:, 2] = 1.0  # whose lit pixels do not reach the corners of their rectangle
     tangent = (np.hypot(15.5, 15.1) / 60.0, (15.0 + math.hypot(0.5, 0.1)) / 60.0)
-    for found, round_ in zip(tangent, (False, True), strict=True):
+    for found, shape in zip(tangent, (Aperture, CircularAperture), strict=True):
         one = replace(led, brightness=cross)
-        assert math.tan(one.cone_over((15.0, 15.0), 0.0, round_)) == pytest.approx(found, rel=1e-8)
+        assert math.tan(one.cone_over(Pupil(shape((15.0, 15.0)), 0.0))) == pytest.approx(found, rel=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +146,8 @@ def test_no_corner_of_a_lens_is_outside_the_cone_of_a_disc(source, round_):
     border = np.concatenate([[edge * rx, one * ry], [edge * rx, -one * ry], [one * rx, edge * ry], [-one * rx, edge * ry]], 1)
     border = np.stack([rx * np.cos(turn), ry * np.sin(turn)]) if round_ else border
     widest = float(np.hypot(x[:, None] - border[0], y[:, None] - border[1]).max())
-    tangent = math.tan(source.cone_over((rx, ry), 0.0, round_)) * -pz
+    shape = CircularAperture if round_ else Aperture
+    tangent = math.tan(source.cone_over(Pupil(shape((rx, ry)), 0.0))) * -pz
     assert widest <= tangent < widest * (1.0 + 1e-6)
 
 
@@ -164,7 +178,7 @@ def test_what_a_source_emits_in_all(source, part, words):
         angles = np.radians((np.arange(120_000) + 0.5) / 1000.0)
         flux = np.interp(np.degrees(angles), TABLE.angles, TABLE.values) * np.sin(angles)
         part = flux[:60_000].sum() / flux.sum()
-    found, said = source.emitted(HALF, 0.0)
+    found, said = source.emitted(Pupil(Aperture(HALF), 0.0))
     assert found == pytest.approx(part, rel=1e-8) and words in said
 
 
@@ -295,14 +309,14 @@ def ring(monkeypatch):
 def test_a_source_from_outside(ring, kernels, tmp_path):
     """Through the registries alone: out of [source], into a plan, onto the screen, and out of every export in one sentence."""
     full = complete({"source": {"type": "ring", "power": 2.0}, "lens": {"control": [8, 7]}}, 1.0)
-    assert full["source"]["position"] == [[0.0, 0.0, -20.0]] and full["design"]["stages"][-1]["sampler"] == "stratified"
-    assert "intensity" not in full["source"] and 'type = "ring"' in settings.dump(full)
-    source = settings.build_source(full)
+    assert full.source.position == ((0.0, 0.0, -20.0),) and full.design.stages[-1].sampler == "stratified"
+    assert "intensity" not in full.source and 'type = "ring"' in settings.dump(full)
+    source = settings.build_source(full.source)
     assert isinstance(source, Ring) and source.power == 2.0 and source.nearest == -20.0
     assert source.centre == pytest.approx((0.0, 0.0, -20.0)) and source.powers == pytest.approx((1 / 6,) * 12)
-    settings.refuse_unused(full["source"], ["source.size"])
+    settings.refuse_unused(full.source, ["source.size"])
     with pytest.raises(InputError, match="cone belongs to source point, grid or disc, got ring"):
-        settings.refuse_unused(full["source"], ["source.cone"])
+        settings.refuse_unused(full.source, ["source.cone"])
 
     lens = Lens(size=(10.0, 8.0), control=(8, 7), index=1.5, offset=Offset(5.0, (-40.0, -40.0)))
     scene, field = Scene(source, lens, Screen((12.0, 12.0), 60.0, (20, 16))), HeightField.of(lens)

@@ -169,23 +169,23 @@ def test_bad_sources_are_one_line(capfd, arguments, message):
 
 def test_the_first_sphere_allows_for_the_light_s_divergence():
     base = {"lens": {"size": [10.0, 10.0]}, "screen": {"z": 300.0}}
-    plane = complete(base, 1.0)["lens"]["radius"][0]
+    plane = complete(base, 1.0).lens.radius[0]
     assert plane == pytest.approx(Offset.for_magnification((3.0, 3.0), 1.5443, 300.0, 5.0).radius[0])
-    far = complete({**base, "source": {"type": "point", "position": [[0.0, 0.0, -1e7]]}}, 1.0)["lens"]["radius"][0]
+    far = complete({**base, "source": {"type": "point", "position": [[0.0, 0.0, -1e7]]}}, 1.0).lens.radius[0]
     assert far == pytest.approx(plane, rel=1e-3)
-    near = complete({**base, "source": {"type": "point", "position": [[0.0, 0.0, -50.0]]}}, 1.0)["lens"]["radius"][0]
+    near = complete({**base, "source": {"type": "point", "position": [[0.0, 0.0, -50.0]]}}, 1.0).lens.radius[0]
     assert -60 < near < -30  # it must gather what parallel light would need spread
-    close = complete({**base, "source": {"type": "point", "position": [[0.0, 0.0, -1.0]]}}, 1.0)["lens"]["radius"][0]
+    close = complete({**base, "source": {"type": "point", "position": [[0.0, 0.0, -1.0]]}}, 1.0).lens.radius[0]
     assert close == pytest.approx(-1.25 * np.hypot(5, 5))
 
 
 def test_what_a_section_says_is_what_is_built():
     said = {"type": "point", "position": [[0, 0, -5.0], [1, 0, -6.0]], "powers": [1.0, 3.0], "power": 2.0}
     full = complete({"source": said}, 1.0)
-    source = settings.build_source(full)
+    source = settings.build_source(full.source)
     assert isinstance(source, Points) and source.powers == (0.5, 1.5) and source.positions[1] == (1, 0, -6.0)
-    assert isinstance(settings.build_source(complete({"source": {"type": "disc"}}, 1.0)), Disc)
-    assert settings.build_source(full, type="plane").power == 2.0
+    assert isinstance(settings.build_source(complete({"source": {"type": "disc"}}, 1.0).source), Disc)
+    assert settings.build_source(full.source, type="plane").power == 2.0
 
 
 def test_render_to_a_tolerance(capfd):
@@ -253,7 +253,7 @@ def test_an_option_may_be_meant_for_the_source_of_a_stage(capfd):
         "--quiet",
     )
     project = workflow.Project.open("blob.caustic")
-    assert project.settings["source"]["type"] == "plane"
+    assert project.settings.source.type == "plane"
     assert build_stages(project.settings)[0].source == Points(((0.0, 0.0, -40.0),))
 
 

@@ -9,8 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli.config.completion import Derivation, complete
+from caustic_cli.config.completion import complete
 from caustic_cli.config.settings import build_scene
+from caustic_cli.config.table import Parameters
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import is_ours
 from caustic_cli.optics.bspline import SplineSpace
@@ -44,7 +45,7 @@ def small():
     stages = [{"control": [19, 19], "rays": 5000, "apron": 1}]
     full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [19, 19]}, "design": {"stages": stages}}, 1.0)
     scene = build_scene(full)
-    target = comparison.disc(scene, tuple(full["target"]["size"]))
+    target = comparison.disc(scene, full.target.size)
     return scene, target, full
 
 
@@ -249,9 +250,9 @@ def test_the_runs_of_a_project(small):
 
 
 def test_a_run_begins_by_transport_where_a_design_would():
-    full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [35, 35]}}, 1.0, Derivation(rays=5000))
+    full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [35, 35]}}, 1.0, Parameters(rays=5000))
     scene = build_scene(full)
-    target = torch.from_numpy(comparison.disc(scene, tuple(full["target"]["size"])))
+    target = torch.from_numpy(comparison.disc(scene, full.target.size))
     entries = {
         plan[0]: comparison.TimedDesign(*plan, scene, target)
         for plan in comparison.variants(scene, full)

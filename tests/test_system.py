@@ -17,13 +17,15 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.effects import EFFECTS, Requests
 from caustic_cli.optics.frames import Pose
+from caustic_cli.optics.media import Medium
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.surfaces import HeightField, Nurbs, Plane, Sphere
-from caustic_cli.optics.system import Element, Medium, PlacedScreen, System
+from caustic_cli.optics.surfaces import HeightField, Plane, Sphere
+from caustic_cli.optics.surfaces.nurbs import Nurbs
+from caustic_cli.optics.system import Element, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer, render, trace
-from caustic_cli.scene import Aperture, Light, PlaneWave, Points, Screen
+from caustic_cli.scene import Aperture, CircularAperture, Light, PlaneWave, Points, Screen
 
 pytestmark = pytest.mark.usefixtures("kernels")
 
@@ -136,7 +138,7 @@ def doublet() -> tuple[System, dict]:
         Element("two", WIDE, Aperture((9.0, 9.0)), behind=DENSE, pose=at(5.0)),
         Element("three", WIDE, Aperture((9.0, 9.0)), pose=at(7.0)),
         Element("four", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=at(22.0)),
-        Element("five", Sphere(-70.0), Aperture((9.0, 9.0), round=True), pose=at(26.0)),
+        Element("five", Sphere(-70.0), CircularAperture((9.0, 9.0)), pose=at(26.0)),
     )
     heights = {
         "one": parabola(FIELD, 45.0),

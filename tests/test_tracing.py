@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
-from caustic_cli.optics.rays import LOSSES, RayState, Status
+from caustic_cli.optics.rays import LOSSES, RayState, RayStatus
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS, Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -94,7 +94,7 @@ def test_landing_points_are_the_closed_form(kind, degree, index, bumps):
         landing = land(scene, heights, sample)
         status = landing.statuses().numpy()
         clear = np.abs(square) > 1e-3
-        np.testing.assert_array_equal(status[clear], np.where(square > 0, Status.OK, Status.TOTAL_INTERNAL_REFLECTION)[clear])
+        np.testing.assert_array_equal(status[clear], np.where(square > 0, RayStatus.OK, RayStatus.TOTAL_INTERNAL_REFLECTION)[clear])
         keep = clear & (square > 0)
         np.testing.assert_allclose(landing.origin[0].numpy()[keep], x[keep], rtol=0, atol=1e-10)
         np.testing.assert_allclose(landing.origin[1].numpy()[keep], y[keep], rtol=0, atol=1e-10)
@@ -131,7 +131,7 @@ def test_prism_by_trigonometry(slope):
         landing = land(scene, heights, sample)
         r0 = 0.0 if kind == "none" else 0.04
         if slope > 1:
-            assert bool((landing.statuses() == Status.TOTAL_INTERNAL_REFLECTION).all())
+            assert bool((landing.statuses() == RayStatus.TOTAL_INTERNAL_REFLECTION).all())
             assert float(landing.lost["total_internal_reflection"]) == pytest.approx(1 - r0, rel=1e-13)
             assert not landing.power.any()
             continue
@@ -204,10 +204,12 @@ def test_status_tells_what_became_of_a_ray():
     square = closed_form(scene, heights, x, y)[2]
     space_u, space_v = HeightField.of(scene.lens).spaces
     z = ((space_u.matrix(sample.u) @ heights) * space_v.matrix(sample.v)).sum(1).numpy()
-    expected = np.where(square <= 0, Status.TOTAL_INTERNAL_REFLECTION, np.where(z >= 3.3, Status.AWAY_FROM_SCREEN, Status.OK))
+    expected = np.where(
+        square <= 0, RayStatus.TOTAL_INTERNAL_REFLECTION, np.where(z >= 3.3, RayStatus.AWAY_FROM_SCREEN, RayStatus.OK)
+    )
     np.testing.assert_array_equal(landing.statuses().numpy(), expected)
     assert min(np.bincount(expected, minlength=3)) > 100
-    assert bool(((landing.power > 0) == (landing.statuses() == Status.OK)).all())
+    assert bool(((landing.power > 0) == (landing.statuses() == RayStatus.OK)).all())
     total = landing.power.sum() + sum(landing.lost.values())
     assert float(total) == pytest.approx(1.0, abs=1e-12)
 
@@ -301,7 +303,7 @@ def test_float32_landing_error(kind, kernels):
     sample = single_sample(kind, (60, 60))
     heights = 3000.0 + 0.02 * torch.randn(30, 25, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     exact, rounded = land(scene, heights, sample), land(scene, heights, sample, torch.float32)
-    assert bool((exact.statuses() == Status.OK).all())
+    assert bool((exact.statuses() == RayStatus.OK).all())
     assert torch.equal(exact.statuses(), rounded.statuses())
     (x, y), (x_rounded, y_rounded) = exact.origin[:2], rounded.origin[:2]
     if kernels == "fused":
@@ -385,8 +387,8 @@ def test_gradcheck_of_the_image(kind, fresnel):
     scene = replace(scene, screen=replace(scene.screen, z=10.0))
     heights = heights_of(scene, 1.1, seed=2).requires_grad_()
     landing = land(scene, heights.detach(), single_sample(kind, (6, 5), 1))
-    assert int((landing.statuses() == Status.OK).sum()) > 15
-    assert int((landing.statuses() == Status.TOTAL_INTERNAL_REFLECTION).sum()) > 1
+    assert int((landing.statuses() == RayStatus.OK).sum()) > 15
+    assert int((landing.statuses() == RayStatus.TOTAL_INTERNAL_REFLECTION).sum()) > 1
     both = exposed(scene, Sampler(kind, (6, 5), 1), Filter("cosine", (3, 3)))
     if fresnel == "none":  # the power that leaves the lens is constant then
         assert torch.autograd.gradcheck(lambda h: both(h)[0], (heights,), eps=1e-7, atol=1e-6, rtol=1e-5, check_forward_ad=True)

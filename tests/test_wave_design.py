@@ -24,7 +24,8 @@ from caustic_cli.inverse.schedule import Rendering
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_magnification, white
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.waves import NoWaveImage, wave_image
+from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import diffraction
 from caustic_cli.studies.metrics import relative_rms
@@ -171,9 +172,9 @@ def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
     monkeypatch.setattr(workflow, "_run", begun)
     small = SMALL if "--resolution" not in extra else [a for a in SMALL if a not in ("--resolution", "32")]
     design(capfd, "blob.png", *small, *extra, "-o", "p")
-    tables = workflow.Project.open("p").settings["design"]["stages"]
-    assert any(t.get("waves") for t in tables) == stages
-    assert not stages or [len(t["waves"]) for t in tables if t.get("waves")] == [WAVES["standard"][0]] * len(WAVES["standard"][1])
+    tables = workflow.Project.open("p").settings.design.stages
+    assert any(t.waves for t in tables) == stages
+    assert not stages or [len(t.waves) for t in tables if t.waves] == [WAVES["standard"][0]] * len(WAVES["standard"][1])
 
 
 OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"

@@ -95,7 +95,7 @@ def run(
     if alpha is not None and reconstruction != "gaussian":
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
     filter = filter_from(reconstruction, size, scene.screen, alpha)
-    sampler = sampler_for(scene, count, opened.settings["design"]["seed"] if seed is None else seed, device)
+    sampler = sampler_for(scene, count, opened.settings.design.seed if seed is None else seed, device)
     compile_for(scene, device, say)
     maps = []
     for point, (image, data) in zip(points, files, strict=True):

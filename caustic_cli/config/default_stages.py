@@ -8,7 +8,7 @@ resolution is used from the beginning.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from caustic_cli.config.settings import Settings
@@ -66,7 +66,7 @@ def usual_sampler(source: Source) -> str:
     return "lines" if source.collimated else "stratified"
 
 
-def completed_stage(table: Table, s: Settings, sampler: str) -> Table:
+def completed_stage(table: Mapping[str, Any], s: Settings, sampler: str) -> Table:
     """A user-defined stage with its missing keys completed."""
     base = stage_base(s, sampler)
     return {**({k: base[k] for k in WAVE_KEYS} if table.get("waves") else base), **table}
@@ -74,9 +74,9 @@ def completed_stage(table: Table, s: Settings, sampler: str) -> Table:
 
 def stage_base(s: Settings, sampler: str) -> Table:
     """Defaults of a user-defined stage."""
-    nx, ny = s["screen"]["resolution"]
+    nx, ny = s.screen.resolution
     return on_rays(
-        s["lens"]["control"],
+        s.lens.control,
         int(RAYS_PER_PIXEL * nx * ny),
         sampler,
         iterations=default("design.stages.iterations"),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 
-from caustic_cli.config.default_stages import Table, stage_base
-from caustic_cli.config.settings import Settings, build_screen, build_source, value_of
-from caustic_cli.config.table import check
+from caustic_cli.config.default_stages import stage_base
+from caustic_cli.config.settings import Settings, build_screen, build_source
+from caustic_cli.config.table import StageSettings, check_all
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.parametrisation import Architecture, Parametrisation
@@ -16,7 +19,7 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
 
 
-def relative_to_initial(design: Table) -> bool:
+def relative_to_initial(design: Mapping[str, Any]) -> bool:
     """Whether the design uses a network whose outputs are relative to an initial surface."""
     return design["network"] != "none" and design.get("preconditioner") == "laplacian"
 
@@ -42,54 +45,50 @@ def build_stages(settings: Settings) -> list[Stage]:
     Raises:
         InputError: there are none, a value is out of range, or the last stage does not use the lens' control net.
     """
-    stages = [stage_of(table, settings) for table in settings["design"].get("stages", [])]
+    stages = [stage_of(table, settings) for table in settings.design.stages]
     if not stages:
         raise InputError("[[design.stages]] at least one stage is needed")
-    if list(stages[-1].control) != list(settings["lens"]["control"]):
+    if stages[-1].control != settings.lens.control:
         raise InputError(
             f"[[design.stages]] the last stage's control {list(stages[-1].control)} must be the lens' own,"
-            f" {settings['lens']['control']}"
+            f" {list(settings.lens.control)}"
         )
     return stages
 
 
-def stage_of(table: Table, settings: Settings) -> Stage:
+def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
     """The stage of a table of complete settings."""
-    t = stage_base(settings, "grid") | table
-    filter = filter_from(
-        t["reconstruction"], t["filter_size"], build_screen(settings), t.get("alpha_per_mm2"), t.get("alpha_per_pixel2")
-    )
-    source = build_source(settings, type=t["source"]) if "source" in t else None
+    t = StageSettings(stage_base(settings, "grid"), table)
+    filter = filter_from(t.reconstruction, t.filter_size, build_screen(settings.screen), t.alpha_per_mm2, t.alpha_per_pixel2)
     return Stage(
-        tuple(t["control"]),
-        t["rays"],
-        t["sampler"],
-        Rendering(filter, t["blur"], t["apron"], t["oversample"], settings["design"]["filter_target"]),
-        t["iterations"],
-        t["tolerance"],
-        source,
-        tuple(t.get("waves", ())),
-        value_of(t, "design.stages.spread"),
-        value_of(t, "design.stages.lenslets"),
+        t.control,
+        t.rays,
+        t.sampler,
+        Rendering(filter, t.blur, t.apron, t.oversample, settings.design.filter_target),
+        t.iterations,
+        t.tolerance,
+        None if t.source is None else build_source(settings.source, type=t.source),
+        t.waves or (),
+        t.spread,
+        t.lenslets,
     )
 
 
 def build_options(settings: Settings) -> Options:
     """The design options of complete settings."""
-    d = settings["design"]
-    for key in ("dtype", "seed", "iterations"):
-        check(f"design.{key}", d[key])
+    d = settings.design
+    check_all("design", d, "dtype", "seed", "iterations")
     for key in ("time_limit", "checkpoint_every"):  # which may be infinite
         if not d[key] > 0:
             raise InputError(f"⟨design.{key}⟩ must be greater than 0 s, got {d[key]:g}")
-    architecture = Architecture(*(value_of(d, f"design.{key}") for key in ("network_layers", "network_width", "activation")))
+    architecture = Architecture(d.network_layers, d.network_width, d.activation)
     return Options(
-        d["loss"],
-        d["optimizer"],
-        d["lr"],
-        Parametrisation(d["network"], d["initial"], d["preconditioner"], architecture),
-        d["seed"],
-        getattr(torch, d["dtype"]),
-        Limits(d["max_slope"], d["min_radius"]),
-        d["waves"] == "on",
+        d.loss,
+        d.optimizer,
+        d.lr,
+        Parametrisation(d.network, d.initial, d.preconditioner, architecture),
+        d.seed,
+        getattr(torch, d.dtype),
+        Limits(d.max_slope, d.min_radius),
+        d.waves == "on",
     )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from caustic_cli.config import settings
-from caustic_cli.config.settings import TABLES, Settings
+from caustic_cli.config.settings import TABLES, Given
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError, alternatives
 
@@ -76,7 +76,7 @@ def checked(given: Mapping[str, Any], sections: Mapping[str, Any], where: str) -
         if section and not isinstance(raw.setdefault(section, {}), dict):
             raise InputError(f"{where}: [{section}] is a list of tables, beside which {key} cannot be given")
         (raw[section] if section else raw)[key] = value
-    typed: Settings = settings.checked(raw, where, parameters=True)
+    typed: Given = settings.checked(raw, where, parameters=True)
     return {f"{section}.{key}" if section else key: value for section, values in typed.items() for key, value in values.items()}
 
 

@@ -1,7 +1,8 @@
 """Reading and writing of project.toml, and construction of the scene from it.
 
-Settings are a nested dict with the keys of the file (`Settings`); names, types and defaults are defined in `config.table`.  Keys
-and types are checked here, ranges when the scene and the stages are constructed.
+What a user gives is a nested dict with the keys of the file (`Given`); completed, it is a `Settings` of typed sections.  Names,
+types and defaults are defined in `config.table`.  Keys and types are checked here, ranges when the scene and the stages are
+constructed.
 """
 
 from __future__ import annotations
@@ -10,25 +11,38 @@ import math
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import tomli_w
 
 from caustic_cli import __version__
-from caustic_cli.config.table import Setting, check, default, in_section
+from caustic_cli.config.table import (
+    DesignSettings,
+    ElementSettings,
+    LensSettings,
+    ScreenSettings,
+    SecondSettings,
+    Section,
+    Setting,
+    SourceSettings,
+    StageSettings,
+    TargetSettings,
+    check,
+    in_section,
+)
 from caustic_cli.errors import InputError, alternatives, near
 from caustic_cli.io.files import read_bytes
-from caustic_cli.scene import Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
+from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
 from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import PLANE, Sags
 from caustic_cli.scene.sources.section import content
 
-#: Settings by section and key.
-Settings = dict[str, dict[str, Any]]
+#: Settings as given, by section and key.
+Given = dict[str, dict[str, Any]]
 FORMAT_VERSION = 1
 MAX_BYTES = 1 << 23  # of a TOML file, enough for a hundred thousand source points
 ACCEPTED = "a TOML file is needed"
@@ -54,8 +68,6 @@ def _schema() -> dict[str, dict[str, Setting]]:
 
 
 SCHEMA = _schema()
-#: Optional sections.
-OPTIONAL = ("second", "element")
 STAGE, ELEMENT = in_section("design.stages"), in_section("element")
 #: Keys that hold tables: their heading in the file, and their keys.  Sources after the first are stored in [source] also; keys in
 #: FIRST belong to the first source only.
@@ -65,19 +77,12 @@ TABLES = {
     ("element", "list"): ("element", ELEMENT),
     ("source", "also"): ("source", {k: v for k, v in SCHEMA["source"].items() if k not in FIRST}),
 }
-#: Defaults that are written to a new project's file.
-DEFAULTS = {
-    section: {key: row.default for key, row in keys.items() if row.written and row.default is not None}
-    for section, keys in SCHEMA.items()
-}
-
-
 #: Parameters from which settings are derived, such as mag: allowed in a configuration, before its first section, but not in a
 #: project.
 PARAMETERS = {key: row for key, row in in_section("").items() if row.kind != "tables"}
 
 
-def parse(text: str, where: str, parameters: bool = False) -> Settings:
+def parse(text: str, where: str, parameters: bool = False) -> Given:
     """Settings from TOML text: every key known and of its type; defaults are not filled in.
 
     Args:
@@ -91,7 +96,7 @@ def parse(text: str, where: str, parameters: bool = False) -> Settings:
     if type(version) is not int or not 1 <= version <= FORMAT_VERSION:
         raise InputError(f"{where}: has format_version {version!r}; this caustic {__version__} reads 1 to {FORMAT_VERSION}")
     raw.pop("created_by", None)
-    out: Settings = {}
+    out: Given = {}
     for section, table in raw.items():
         if parameters and section in PARAMETERS:
             out.setdefault("", {})[section] = _typed(f"{where}: {section}", section, table, PARAMETERS)
@@ -156,7 +161,7 @@ def _refuse_deep(text: str, where: str) -> None:
             raise InputError(f"{where}: line {text.count(chr(10), 0, found.start()) + 1} {wrong}")
 
 
-def checked(given: Mapping[str, Any], where: str, parameters: bool = False) -> Settings:
+def checked(given: Mapping[str, Any], where: str, parameters: bool = False) -> Given:
     """Settings given as Python or NumPy values, with the same checks as those of a file; parameters: as for `parse`."""
 
     def plain(value):
@@ -219,10 +224,44 @@ def _numeric(where: str, value, whole: bool):
     return value if whole else float(value)
 
 
-def with_defaults(settings: Settings) -> Settings:
-    """Settings with all mandatory sections, and with constant defaults filled in."""
-    sections = [section for section in SCHEMA if section in settings or section not in OPTIONAL]
-    return {section: {**DEFAULTS[section], **settings.get(section, {})} for section in sections}
+@dataclass(frozen=True)
+class Settings:
+    """The settings of a project by section, complete unless `config.completion` is at work on them."""
+
+    source: SourceSettings
+    lens: LensSettings
+    screen: ScreenSettings
+    target: TargetSettings
+    design: DesignSettings
+    second: SecondSettings | None = None
+    elements: tuple[ElementSettings, ...] = ()
+
+    @classmethod
+    def of(cls, given: Given) -> Self:
+        """Settings with the given ones, and the defaults that a new project's file contains."""
+        source, design = (dict(given.get(section, {})) for section in ("source", "design"))
+        if "also" in source:
+            source["also"] = [SourceSettings.of(table) for table in source["also"]]
+        if "stages" in design:
+            design["stages"] = [StageSettings(table) for table in design["stages"]]
+        return cls(
+            SourceSettings.of(source),
+            LensSettings.of(given.get("lens", {})),
+            ScreenSettings.of(given.get("screen", {})),
+            TargetSettings.of(given.get("target", {})),
+            DesignSettings.of(design),
+            SecondSettings.of(given["second"]) if "second" in given else None,
+            tuple(map(ElementSettings, given.get("element", {}).get("list", ()))),
+        )
+
+    def changed(self, **sections: Any) -> Self:
+        """The settings with other sections."""
+        return replace(self, **sections)
+
+    def value(self, path: str) -> Any:
+        """The value of a setting, or its default, by its path in `config.table`; None in a section that is not there."""
+        section, _, key = path.partition(".")
+        return getattr(getattr(self, section), key, None)
 
 
 def dump(settings: Settings) -> str:
@@ -232,19 +271,18 @@ def dump(settings: Settings) -> str:
         f"format_version = {FORMAT_VERSION}",
         f'created_by = "caustic {__version__}"',
     ]
-    for section, keys in SCHEMA.items():
-        first = settings.get(section, {})
-        also = first.get("also", []) if section == "source" else []
-        for table in (first, *also) if keys and (section in settings or section not in OPTIONAL) else ():
-            lines += ["", f"[[{section}]]" if also else f"[{section}]", *_assignments(table, keys)]
-    for element in elements_of(settings):
+    for section in (settings.source, settings.lens, settings.screen, settings.target, settings.second, settings.design):
+        also = section.also if isinstance(section, SourceSettings) else ()
+        for table in () if section is None else (section, *also):
+            lines += ["", f"[[{table.section}]]" if also else f"[{table.section}]", *_assignments(table, SCHEMA[table.section])]
+    for element in settings.elements:
         lines += ["", "[[element]]", *_assignments(element, ELEMENT)]
-    for stage in settings.get("design", {}).get("stages", []):
+    for stage in settings.design.stages:
         lines += ["", "[[design.stages]]", *_assignments(stage, STAGE)]
     return "\n".join(lines) + "\n"
 
 
-def _assignments(values: dict[str, Any], keys: dict[str, Setting]) -> list[str]:
+def _assignments(values: Mapping[str, Any], keys: dict[str, Setting]) -> list[str]:
     rows = [(f"{key} = {_toml(values[key])}", spec.note) for key, spec in keys.items() if key in values]
     width = min(40, max((len(text) for text, _ in rows), default=0))
     return [f"{text:<{width}}  # {note}" if note else text for text, note in rows]
@@ -256,58 +294,62 @@ def _toml(value) -> str:
     return tomli_w.dumps({"k": value})[len("k = ") :].strip()
 
 
-def elements_of(settings: Settings) -> list[dict[str, Any]]:
-    """The [[element]] tables."""
-    return settings.get("element", {}).get("list", [])
+def tables_of(settings: Settings) -> Given:
+    """The settings as given ones: sections as dicts of those that are set, with lists."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Section):
+            return {key: plain(one) for key, one in value.items()}
+        return [plain(one) for one in value] if isinstance(value, tuple) else value
+
+    found = {name: plain(getattr(settings, name)) for name in ("source", "lens", "screen", "target", "design", "second")}
+    if settings.elements:
+        found["element"] = {"list": plain(settings.elements)}
+    return {name: table for name, table in found.items() if table is not None}
 
 
-def value_of(table: Mapping[str, Any], path: str) -> Any:
-    """The value of a setting in a section's table, or its default."""
-    return table.get(path.rpartition(".")[2], default(path))
-
-
-def index_of(lens: dict[str, Any]) -> float:
+def index_of(lens: LensSettings) -> float:
     """Refractive index from the keys index, or glass and wavelength."""
-    if "glass" in lens:
-        if "index" in lens:
-            raise InputError("[lens] takes index or glass, not both")
-        return refractive_index(lens["glass"], value_of(lens, "lens.wavelength"))
-    return value_of(lens, "lens.index")
+    if lens.glass is None:
+        return lens.index
+    if "index" in lens:
+        raise InputError("[lens] takes index or glass, not both")
+    return refractive_index(lens.glass, lens.wavelength)
 
 
-def build_lens(settings: Settings) -> Lens:
+def build_lens(lens: LensSettings) -> Lens:
     """The lens of the [lens] section, whose keys must be complete."""
-    lens = settings["lens"]
     if ("knots_u" in lens) != ("knots_v" in lens):
         raise InputError("⟨lens.knots_u⟩ and knots_v go together: give both or neither")
-    knots = (tuple(lens["knots_u"]), tuple(lens["knots_v"])) if "knots_u" in lens else None
-    offset = Offset(lens["thickness"], tuple(lens["radius"]))
-    values = content(lens, "index_file", np.ndarray)
     return Lens(
-        tuple(lens["size"]),
-        lens["z_in"],
+        lens.size,
+        lens.z_in,
         index_of(lens),
-        tuple(lens["control"]),
-        tuple(lens["degree"]),
-        knots,
-        lens["min_thickness"],
-        offset,
-        tuple(lens["height_range"]),
-        lens["fresnel"],
-        glass=lens.get("glass"),
-        gradient=build_gradient(lens, values),
-        **{key: value_of(lens, f"lens.{key}") for key in ("absorption", "roughness", "mirror", "aperture", "border")},
-        array=tuple(value_of(lens, "lens.array")),
+        lens.control,
+        lens.degree,
+        None if lens.knots_u is None or lens.knots_v is None else (lens.knots_u, lens.knots_v),
+        lens.min_thickness,
+        Offset(lens.thickness, lens.radius),
+        lens.height_range,
+        lens.fresnel,
+        lens.absorption,
+        lens.roughness,
+        lens.glass,
+        lens.mirror,
+        lens.aperture,
+        lens.border,
+        lens.array,
+        gradient=build_gradient(lens),
     )
 
 
-def build_gradient(lens: dict[str, Any], values: np.ndarray | None) -> Gradient | None:
-    """The gradient index of the [lens] section, None if the lens is homogeneous; values: of its index_file.
+def build_gradient(lens: LensSettings) -> Gradient | None:
+    """The gradient index of the [lens] section, None if the lens is homogeneous.
 
     Raises:
         InputError: terms or a file are missing, or belong to another kind.
     """
-    kind = lens.get("gradient")
+    kind, values = lens.gradient, content(lens, "index_file", np.ndarray)
     if kind is None and not {"gradient_terms", "index_file"} & {*lens}:
         return None
     if kind is not None:
@@ -319,101 +361,97 @@ def build_gradient(lens: dict[str, Any], values: np.ndarray | None) -> Gradient 
     if kind == "volume" and values is None:
         raise InputError("⟨lens.gradient⟩ volume needs ⟨lens.index_file⟩, a .npy of control values")
     if kind is not None and kind in KINDS:
-        return Gradient(kind, tuple(lens.get("gradient_terms", ())))
+        return Gradient(kind, lens.gradient_terms or ())
     return None if values is None else Gradient("volume", (), values)
 
 
-def build_source(settings: Settings, profile: np.ndarray | None = None, type: str | None = None) -> Source:
-    """The source of the [source] section, or the same with another `type`; profile: its irradiance, if any.
+def build_source(source: SourceSettings, type: str | None = None) -> Source:
+    """The source of the [source] section, or the same with another `type`.
 
     Keys that the type does not use are ignored, so that stages can change the type.
     """
-    s = settings["source"]
-    made, lit = sources.type_of(type or s["type"]), sources.used_by("profile")
-    check("source.power", s["power"])  # before it is distributed to points
-    if "profile" in s and not {made.name, s["type"]} & set(lit):
-        raise InputError(f"⟨source.profile⟩ belongs to type {alternatives(lit)}, got type {s['type']}")
-    one = made.from_settings(s, profile)
-    return one if type is not None else sources.combined(one, s)
+    made, lit = sources.type_of(type or source.type), sources.used_by("profile")
+    check("source.power", source.power)  # before it is distributed to points
+    if "profile" in source and not {made.name, source.type} & set(lit):
+        raise InputError(f"⟨source.profile⟩ belongs to type {alternatives(lit)}, got type {source.type}")
+    profile = content(source, "profile", np.ndarray)
+    one = made.from_settings(source, profile)
+    return one if type is not None else sources.combined(one, source)
 
 
-def build_scene(settings: Settings, profile: np.ndarray | None = None) -> Scene:
-    """The complete scene; profile: irradiance of the source, if [source] has one."""
+def build_scene(settings: Settings) -> Scene:
+    """The complete scene."""
     return Scene(
-        build_source(settings, profile),
-        build_lens(settings),
-        build_screen(settings),
+        build_source(settings.source),
+        build_lens(settings.lens),
+        build_screen(settings.screen),
         build_light(settings),
         build_second(settings),
-        build_elements(settings),
+        tuple(_component(element, settings.lens.wavelength) for element in settings.elements),
     )
 
 
-def build_elements(settings: Settings) -> tuple[Component, ...]:
-    """The lenses and mirrors of the [[element]] tables, whose sizes must be given."""
-    return tuple(_element(table, settings["lens"]) for table in elements_of(settings))
-
-
-def _element(table: dict[str, Any], lens: dict[str, Any]) -> Component:
-    kind = check("element.type", table.get("type", "lens"))
+def _component(element: ElementSettings, wavelength: float) -> Component:
+    """The lens or mirror of an [[element]] table, whose size must be given."""
+    kind = check("element.type", element.get("type", "lens"))
     for key in ("z", "size"):
-        if key not in table:
+        if key not in element:
             raise InputError(f"⟨element.{key}⟩ must be given in every [[element]]")
-    only = ("thickness", "index", "glass", "absorption") if kind == "mirror" else ()
-    for key in only:
-        if key in table:
+    for key in ("thickness", "index", "glass", "absorption") if kind == "mirror" else ():
+        if key in element:
             raise InputError(f"⟨element.{key}⟩ is for lenses: light never enters a mirror")
-    if {"index", "glass"} <= {*table}:
+    if {"index", "glass"} <= {*element}:
         raise InputError("[[element]] takes index or glass, not both")
-    glass = table.get("glass")
-    index = refractive_index(glass, value_of(lens, "lens.wavelength")) if glass else value_of(table, "element.index")
-    return Component(
-        kind,
-        table["z"],
-        tuple(table["size"]),
-        radius=tuple(table.get("radius", PLANE)),
-        index=index,
-        glass=glass,
-        tilt=tuple(table.get("tilt", (0.0, 0.0))),
-        **{key: value_of(table, f"element.{key}") for key in ("thickness", "absorption", "aperture", "free")},
+    return COMPONENTS[kind](
+        element.z,
+        element.size,
+        radius=element.radius or PLANE,
+        index=refractive_index(element.glass, wavelength) if element.glass else element.index,
+        glass=element.glass,
+        tilt=element.tilt or (0.0, 0.0),
+        thickness=element.thickness,
+        absorption=element.absorption,
+        aperture=element.aperture,
+        free=element.free,
     )
 
 
 def build_second(settings: Settings) -> SecondTarget | None:
     """The second target of the [second] section, None without one."""
-    s = settings.get("second", {})
+    s = settings.second
+    if s is None:
+        return None
     if "file" in s:
-        screen = build_screen(settings)
-        margin = [a / b for a, b in zip(screen.size, settings["target"]["size"], strict=True)]
-        return SecondTarget(Screen((margin[0] * s["size"][0], margin[1] * s["size"][1]), s["z"], screen.resolution))
+        screen = build_screen(settings.screen)
+        margin = [a / b for a, b in zip(screen.size, settings.target.size, strict=True)]
+        return SecondTarget(Screen((margin[0] * s.size[0], margin[1] * s.size[1]), s.z, screen.resolution))
     if "focus" in s:
-        return SecondTarget(focus=tuple(s["focus"]))
-    return SecondTarget() if s.get("collimate") else None
+        return SecondTarget(focus=s["focus"])
+    return SecondTarget() if s.collimate else None
 
 
-def build_screen(settings: Settings) -> Screen:
+def build_screen(screen: ScreenSettings) -> Screen:
     """The screen of the [screen] section."""
-    s = settings["screen"]
-    sags = content(s, "shape_file", np.ndarray)
-    if "shape_file" in s and sags is None:
-        raise InputError(f"⟨screen.shape_file⟩ {s['shape_file']!r} was not read: a file of heights is needed")
+    sags = content(screen, "shape_file", np.ndarray)
+    if "shape_file" in screen and sags is None:
+        raise InputError(f"⟨screen.shape_file⟩ {screen['shape_file']!r} was not read: a file of heights is needed")
     return Screen(
-        tuple(s["size"]),
-        s["z"],
-        tuple(s["resolution"]),
-        tuple(value_of(s, "screen.tilt")),
-        tuple(value_of(s, "screen.shift")),
-        tuple(s.get("radius", PLANE)),
-        None if sags is None else Sags(sags, tuple(s["size"])),
+        screen.size,
+        screen.z,
+        screen.resolution,
+        screen.tilt,
+        screen.shift,
+        screen.radius or PLANE,
+        None if sags is None else Sags(sags, screen.size),
     )
 
 
 def build_light(settings: Settings) -> Light:
     """Wavelengths and polarisation of the [source] section, combined for several sources."""
-    return sources.light_of_all(settings["source"], value_of(settings["target"], "target.color"))
+    return sources.light_of_all(settings.source, settings.target.color)
 
 
-def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence[str | None] = ()) -> None:
+def refuse_unused(source: Mapping[str, Any], given: Iterable[str], stages: Sequence[str | None] = ()) -> None:
     """Reject settings, given by path for the current run, that the source type and those of all stages ignore.
 
     Keys in a file may remain when the type changes.
@@ -433,17 +471,17 @@ def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence
                 raise InputError(f"⟨source.{key}⟩ {idle[key]}")
 
 
-def by_section(given: Mapping[str, Any]) -> Settings:
-    """Settings from values by their paths in `config.table`; parameters without a section become the section ""."""
-    found: Settings = {}
+def by_section(given: Mapping[str, Any]) -> Given:
+    """Given from values by their paths in `config.table`; parameters without a section become the section ""."""
+    found: Given = {}
     for path, value in given.items():
         section, _, key = path.rpartition(".")
         found.setdefault(section, {})[key] = value
     return found
 
 
-def implied(given: Settings) -> Settings:
-    """Settings of one level, a file or the options, with those that they imply: a diameter at infinity a disc, and a network adam.
+def implied(given: Given) -> Given:
+    """Given of one level, a file or the options, with those that they imply: a diameter at infinity a disc, and a network adam.
 
     A type or an optimiser of the same level takes precedence, those of other levels do not.
     """
@@ -456,8 +494,8 @@ def implied(given: Settings) -> Settings:
     return out
 
 
-def merged(first: Settings, *others: Settings) -> Settings:
-    """Settings merged key by key, later ones taking precedence; an index replaces a glass, and vice versa."""
+def merged(first: Given, *others: Given) -> Given:
+    """Given merged key by key, later ones taking precedence; an index replaces a glass, and vice versa."""
     out = {section: dict(table) for section, table in first.items()}
     for other in others:
         if {"index", "glass"} & {*other.get("lens", {})}:
@@ -468,8 +506,8 @@ def merged(first: Settings, *others: Settings) -> Settings:
     return out
 
 
-def read(path: Path, parameters: bool = False) -> Settings:
-    """Settings from a TOML file of at most MAX_BYTES; parameters: as for `parse`.
+def read(path: Path, parameters: bool = False) -> Given:
+    """Given from a TOML file of at most MAX_BYTES; parameters: as for `parse`.
 
     Raises:
         InputError: the file is missing, too large or not text, or `parse` rejects it.

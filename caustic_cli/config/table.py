@@ -1,8 +1,9 @@
 """The table of settings: the single definition of every parameter of a project.
 
-A row defines the name of a setting, its type, unit, range and default with its reason, its meaning, and its command-line option.
-project.toml (`config.settings`), the defaults of the scene's dataclasses, the commands' options, the manual pages and the reference
-are generated from it.  It is plain data that imports errors and checks only, so that every other package may import it.
+A section of project.toml is a class, and a setting one of its attributes: the row that declares it gives its type, unit, range and
+default with its reason, its meaning, and its command-line option.  project.toml (`config.settings`), the defaults of the scene's
+dataclasses, the commands' options, the manual pages and the reference are generated from these rows.  They import errors and checks
+only, so that every other package may import them.
 
 A path consists of a section and a key: `lens.size` is `[lens] size` in project.toml.  A path without a section is a parameter from
 which settings are derived and which is not stored in a project: `mag` determines `target.size`.
@@ -11,9 +12,9 @@ which settings are derived and which is not stored in a project: `mag` determine
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 from caustic_cli.config import checks
 from caustic_cli.errors import InputError
@@ -25,46 +26,63 @@ WAVELENGTHS = (100.0, 20_000.0)
 
 @dataclass(frozen=True)
 class Option:
-    """The command-line option of a setting: its name, the placeholder of its value, and the commands that have it.
-
-    constant: the value that a flag stands for; common: whether it is an option of every command, which is not generated from this
-    table.
-    """
+    """The command-line option of a setting."""
 
     name: str
+    #: The placeholder of its value.
     metavar: str | None = None
+    #: The commands that have it.
     commands: tuple[str, ...] = ("design",)
+    #: The value that a flag stands for.
     constant: Any = None
+    #: Whether it is an option of every command, which is not generated from this table.
     common: bool = False
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A row of the table.
+    """A row of the table.  As an attribute of a section it is read as the value there, or the default; None without either."""
 
-    path: see the module; kind: number, whole, text, flag, numbers (a pair), wholes (a pair), list (of numbers), points ([x, y, z]
-    or a list of such), tables (a list of tables as text); help: description, for comments, options and the reference; unit; low,
-    high,
-    above: range of each number, `above` if low itself is excluded; choices: of a text; default: None if there is none or if it is
-    derived; derived: how it is derived; why: the reason for the default; written: whether a new project's file contains the
-    default;
-    option: of the command line; speaks_for: other paths that the same option sets.
-    """
-
+    #: Section and key, see the module.
     path: str
+    #: number, whole, text, flag, numbers (a pair), wholes (a pair), list (of numbers), points ([x, y, z] or a list of such), tables
+    #: (a list of tables as text).
     kind: str
+    #: Description, for comments, options and the reference.
     help: str
     unit: str = ""
+    #: Range of each number, without `low` itself if `above`.
     low: float = -math.inf
     high: float = math.inf
     above: bool = False
+    #: Of a text.
     choices: tuple[str, ...] = ()
+    #: None if there is none or if it is derived.
     default: Any = None
+    #: How the default is derived.
     derived: str = ""
+    #: The reason for the default.
     why: str = ""
+    #: Whether a new project's file contains the default.
     written: bool = True
+    #: Of the command line.
     option: Option | None = None
+    #: Other paths that the same option sets.
     speaks_for: tuple[str, ...] = ()
+    #: Name in a project, without suffix, of the file that it names.
+    file: str = ""
+    #: Path of the row before which a parameter is listed.
+    before: str = ""
+
+    def __set_name__(self, owner: type[Section], name: str) -> None:
+        object.__setattr__(self, "path", f"{owner.section}.{name}".lstrip("."))
+        object.__setattr__(self, "kind", KINDS[owner.__annotations__[name].removesuffix(" | None")])
+
+    def __get__(self, section: Section | None, owner: type[Section]) -> Any:
+        return self if section is None else section.get(self.key, _frozen(self.default))
+
+    def __set__(self, section: Section, value: Any) -> None:
+        raise AttributeError(f"{self.path} is not to be changed: `changed` returns another section")
 
     @property
     def section(self) -> str:
@@ -117,282 +135,391 @@ class Setting:
         return checks.number(where, value, self.low, self.high, open_low=self.above)
 
 
+def setting(help: str, unit: str = "", low: float = -math.inf, high: float = math.inf, **row: Any) -> Any:
+    """A setting as an attribute of a section, whose name and annotation are its key and kind (`KINDS`)."""
+    return Setting("", "", help, unit, low, high, **row)
+
+
+class Section(Mapping[str, Any]):
+    """The settings of a section: attributes are their values or defaults, and as a mapping it holds those that are set.
+
+    Its values cannot be changed; lists become tuples.
+    """
+
+    section = ""
+
+    def __init__(self, *given: Mapping[str, Any], **values: Any):
+        self._values = {key: _frozen(value) for table in (*given, values) for key, value in table.items()}
+
+    def __getitem__(self, key: str) -> Any:
+        return self._values[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def changed(self, **values: Any) -> Self:
+        """The section with other values."""
+        return type(self)(self, values)
+
+    def filled(self, **values: Any) -> Self:
+        """The section with values of the keys that are not set."""
+        return type(self)(values, self)
+
+    def without(self, *keys: str) -> Self:
+        """The section in which keys are not set."""
+        return type(self)({key: value for key, value in self.items() if key not in keys})
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Self:
+        """The section of a new project, in which the defaults are set that its file contains."""
+        rows = (row for row in vars(cls).values() if isinstance(row, Setting))
+        return cls({row.key: row.default for row in rows if row.written and row.default is not None}, given)
+
+
+def _frozen(value: Any) -> Any:
+    """A value without lists, which could be changed."""
+    return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
+
+
+Pair = tuple[float, float]
+Wholes = tuple[int, int]
+Numbers = tuple[float, ...]
+Point = tuple[float, float, float]
+Points = tuple[Point, ...]
+Tables = tuple[dict[str, Any], ...]
+#: Kinds of settings by their annotations, None aside.
+KINDS = {"float": "number", "int": "whole", "str": "text", "bool": "flag", "Pair": "numbers", "Wholes": "wholes", "Numbers": "list"}
+KINDS |= {"Point": "points", "Points": "points", "Tables": "tables"}
 BOTH = ("design", "render")
+
+
 # fmt: off
-_ROWS = (
-    # The light source
-    Setting("source.type", "text", "plane: collimated light along +z over the aperture; point; grid of points; disc, an extended"
-            " source; rays, a ray file", default="plane", why="the thesis' first source, section 4.2.1",
-            option=Option("--source", commands=BOTH)),
-    Setting("source.power", "number", "total power of the source, through the aperture or into the cone; in lm, images are in lux",
-            "W",
-            0.0, checks.POWER, above=True, default=1.0, why="images are fractions of the source's power",
-            option=Option("--power", "NUMBER[W|lm]", BOTH), speaks_for=("source.power_unit",)),
-    Setting("source.power_unit", "text", "W, or lm for images in lux", choices=("W", "lm"), default="W", written=False),
-    Setting("source.profile", "text", "plane: file in this directory with the relative irradiance over the aperture"),
-    Setting("source.file", "text", "ray file (IES TM-25 .tm25ray, Zemax .dat or .sdf, LightTools .ray or .txt), of which the"
-            " project keeps a copy; for a disc, a picture of its brightness with linear values",
-            option=Option("--source-file", "FILE", BOTH)),
-    Setting("source.position", "points", "point: one or several [x, y, z]; grid, disc: the centre; rays: the file's origin", "mm",
-            *DISTANCE, derived="on the axis, five lens widths in front of the lens", option=Option("--source-position", "X,Y,Z",
-            BOTH)),
-    Setting("source.powers", "list", "point: relative power of each position", low=0.0, high=checks.POWER, derived="equal"),
-    Setting("source.size", "numbers", "full width and height of a grid or disc", "mm", 0.0, 1e9, derived="a fifth of the lens",
-            option=Option("--source-size", "W[xH]", BOTH)),
-    Setting("source.grid", "wholes", "points of a grid along x and y", low=1, high=1000, derived="25 x 25",
-            why="figure 6.4.1 of the thesis", option=Option("--source-grid", "N[xM]", BOTH)),
-    Setting("source.cone", "number", "half-angle of the cone about +z", "degrees", 1e-9, 90.0,
-            derived="the narrowest that covers the lens", option=Option("--cone", "DEG", BOTH)),
-    Setting("source.angle", "number", "disc at infinity (the sun: 0.533): angular diameter", "degrees", 0.0, 170.0,
-            derived="a disc at a finite distance", option=Option("--source-angle", "DEG", BOTH)),
-    Setting("source.intensity", "text",
-            "angular distribution of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of"
+class SourceSettings(Section):
+    """[source]: a light source."""
+
+    section = "source"
+
+    @property
+    def also(self) -> tuple[SourceSettings, ...]:
+        """The sources after the first."""
+        return self.get("also", ())
+
+    type: str = setting("plane: collimated light along +z over the aperture; point; grid of points; disc, an extended source; rays,"
+            " a ray file", default="plane", why="the thesis' first source, section 4.2.1", option=Option("--source", commands=BOTH))
+    power: float = setting("total power of the source, through the aperture or into the cone; in lm, images are in lux", "W", 0.0,
+            checks.POWER, above=True, default=1.0, why="images are fractions of the source's power",
+            option=Option("--power", "NUMBER[W|lm]", BOTH), speaks_for=("source.power_unit",))
+    power_unit: str = setting("W, or lm for images in lux", choices=("W", "lm"), default="W", written=False)
+    profile: str | None = setting("plane: file in this directory with the relative irradiance over the aperture", file="profile")
+    file: str | None = setting("ray file (IES TM-25 .tm25ray, Zemax .dat or .sdf, LightTools .ray or .txt), of which the project"
+            " keeps a copy; for a disc, a picture of its brightness with linear values",
+            option=Option("--source-file", "FILE", BOTH), file="source")
+    position: Points | None = setting("point: one or several [x, y, z]; grid, disc: the centre; rays: the file's origin", "mm",
+            *DISTANCE, derived="on the axis, five lens widths in front of the lens",
+            option=Option("--source-position", "X,Y,Z", BOTH))
+    powers: Numbers | None = setting("point: relative power of each position", low=0.0, high=checks.POWER, derived="equal")
+    size: Pair | None = setting("full width and height of a grid or disc", "mm", 0.0, 1e9, derived="a fifth of the lens",
+            option=Option("--source-size", "W[xH]", BOTH))
+    grid: Wholes | None = setting("points of a grid along x and y", low=1, high=1000, derived="25 x 25", why="figure 6.4.1 of the"
+            " thesis", option=Option("--source-grid", "N[xM]", BOTH))
+    cone: float | None = setting("half-angle of the cone about +z", "degrees", 1e-9, 90.0, derived="the narrowest that covers the"
+            " lens", option=Option("--cone", "DEG", BOTH))
+    angle: float | None = setting("disc at infinity (the sun: 0.533): angular diameter", "degrees", 0.0, 170.0,
+            derived="a disc at a finite distance", option=Option("--source-angle", "DEG", BOTH))
+    intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of"
             " degrees from +z and relative intensity", default="uniform", why="an isotropic source, the simplest",
-            option=Option("--intensity", "uniform|lambertian|FILE", BOTH)),
-    Setting("source.aim", "flag", "sample rays over the lens instead of the whole cone", default=True,
-            why="no rays that miss the lens"),
-    Setting("source.polarisation", "number", "direction of linear polarisation from +x", "degrees", -360.0, 360.0,
-            derived="unpolarised", option=Option("--polarisation", "DEG", BOTH)),
-    Setting("source.wavelengths", "list", "wavelengths of the source's spectrum; a glass has its own index at each", "nm",
+            option=Option("--intensity", "uniform|lambertian|FILE", BOTH), file="intensity")
+    aim: bool = setting("sample rays over the lens instead of the whole cone", default=True, why="no rays that miss the lens")
+    polarisation: float | None = setting("direction of linear polarisation from +x", "degrees", -360.0, 360.0,
+            derived="unpolarised", option=Option("--polarisation", "DEG", BOTH))
+    wavelengths: Numbers | None = setting("wavelengths of the source's spectrum; a glass has its own index at each", "nm",
             *WAVELENGTHS, derived="one wavelength", option=Option("--wavelengths", "NM[:W],...", BOTH),
-            speaks_for=("source.weights",)),
-    Setting("source.weights", "list", "relative power at each wavelength", low=0.0, high=checks.POWER, derived="equal"),
-    # The lens
-    Setting("lens.size", "numbers", "full width and height of the lens' aperture", "mm", *LENS, default=[10.0, 10.0],
-            why="table D.2 of the thesis, in millimetres", option=Option("--lens-size", "W[xH]")),
-    Setting("lens.z_in", "number", "position of the plane entrance, or reference plane of a free-form one", "mm",
-            -checks.LENGTH, checks.LENGTH, default=0.0,
-            why="the origin of the lens"),
-    Setting("lens.thickness", "number", "centre height of the base surface above the lens' origin", "mm", -checks.LENGTH,
-            checks.LENGTH, derived="half the width of a lens up to 20 mm; for a wider one, a least wall of 3 mm; with two"
-            " free-form sides twice the width", why="table D.2 of the thesis; a plate is thin; two sides need a distance",
-            option=Option("--thickness", "MM")),
-    Setting("lens.radius", "numbers", "radii of the base surface along x and y; inf is flat, positive is diverging", "mm",
-            derived="the sphere that spreads the light over the picture", why="table 6.1 of the thesis"),
-    Setting("lens.height_range", "numbers", "least and largest height above the base surface", "mm", -checks.LENGTH, checks.LENGTH,
-            derived="a tenth of the lens' width, or what the first surface needs"),
-    Setting("lens.min_thickness", "number", "least wall thickness, from z_in to the exit", "mm", 0.0, checks.LENGTH, default=1.0,
-            why="a wall that can be machined and mounted", option=Option("--min-thickness", "MM")),
-    Setting("lens.index", "number", "refractive index", low=1.0, high=5.0, above=True, default=1.5443, written=False,
-            why="table D.2 of the thesis", option=Option("--index")),
-    Setting("lens.glass", "text", "material instead of an index, by its common name: acrylic, polycarbonate, BK7, resin,"
-            " water, ... (list: all of them); N-BK7 for a coloured picture", option=Option("--glass", "NAME")),
-    Setting("lens.wavelength", "number", "wavelength of the glass' index", "nm", *WAVELENGTHS, default=587.5618, written=False,
-            why="the d line, for which catalogues give indices"),
-    Setting("lens.fresnel", "text", "reflection losses: none, schlick or exact", choices=("none", "schlick", "exact"),
-            default="exact", why="every uncoated surface reflects"),
-    Setting("lens.absorption", "number", "absorption coefficient a: transmittance exp(-a t) of t mm of glass (Beer-Lambert)",
-            "1/mm", 0.0, 1e6, default=0.0,
-            written=False, option=Option("--absorption", "PER_MM", BOTH)),
-    Setting("lens.roughness", "number", "standard deviation of the exit's microfacet slopes along an axis, mm per mm",
-            low=0.0, high=1.0, default=0.0, written=False, option=Option("--roughness", "SLOPE", BOTH)),
-    Setting("lens.mirror", "flag", "the surface is a mirror, with the screen on the source's side, beside its light",
-            default=False, written=False, option=Option("--mirror")),
-    Setting("lens.aperture", "text", "shape of the lens: rectangle, or circle, the largest within size",
-            choices=("rectangle", "circle"), default="rectangle", written=False,
-            option=Option("--aperture", "rectangle|circle")),
-    Setting("lens.border", "number", "width of a mounting rim around the aperture in exported solids", "mm", 0.0,
-            1e6, default=0.0, written=False, option=Option("--border", "MM")),
-    Setting("lens.array", "wholes", "lenslets along x and y, each of which projects the whole picture", low=1, high=100,
-            default=[1, 1], written=False, option=Option("--array", "N[xM]")),
-    Setting("lens.gradient", "text", "gradient index of the lens: selfoc, radial or axial, with gradient_terms; volume, with an"
+            speaks_for=("source.weights",))
+    weights: Numbers | None = setting("relative power at each wavelength", low=0.0, high=checks.POWER, derived="equal")
+
+
+class LensSettings(Section):
+    """[lens]: the lens."""
+
+    section = "lens"
+    size: Pair = setting("full width and height of the lens' aperture", "mm", *LENS, default=[10.0, 10.0], why="table D.2 of the"
+            " thesis, in millimetres", option=Option("--lens-size", "W[xH]"))
+    z_in: float = setting("position of the plane entrance, or reference plane of a free-form one", "mm", -checks.LENGTH,
+            checks.LENGTH, default=0.0, why="the origin of the lens")
+    thickness: float = setting("centre height of the base surface above the lens' origin", "mm", -checks.LENGTH, checks.LENGTH,
+            derived="half the width of a lens up to 20 mm; for a wider one, a least wall of 3 mm; with two free-form sides twice"
+            " the width", why="table D.2 of the thesis; a plate is thin; two sides need a distance",
+            option=Option("--thickness", "MM"))
+    radius: Pair = setting("radii of the base surface along x and y; inf is flat, positive is diverging", "mm",
+            derived="the sphere that spreads the light over the picture", why="table 6.1 of the thesis")
+    height_range: Pair = setting("least and largest height above the base surface", "mm", -checks.LENGTH, checks.LENGTH,
+            derived="a tenth of the lens' width, or what the first surface needs")
+    min_thickness: float = setting("least wall thickness, from z_in to the exit", "mm", 0.0, checks.LENGTH, default=1.0,
+            why="a wall that can be machined and mounted", option=Option("--min-thickness", "MM"))
+    index: float = setting("refractive index", low=1.0, high=5.0, above=True, default=1.5443, written=False,
+            why="table D.2 of the thesis", option=Option("--index"))
+    glass: str | None = setting("material instead of an index, by its common name: acrylic, polycarbonate, BK7, resin, water, ..."
+            " (list: all of them); N-BK7 for a coloured picture", option=Option("--glass", "NAME"))
+    wavelength: float = setting("wavelength of the glass' index", "nm", *WAVELENGTHS, default=587.5618, written=False,
+            why="the d line, for which catalogues give indices")
+    fresnel: str = setting("reflection losses: none, schlick or exact", choices=("none", "schlick", "exact"), default="exact",
+            why="every uncoated surface reflects")
+    absorption: float = setting("absorption coefficient a: transmittance exp(-a t) of t mm of glass (Beer-Lambert)", "1/mm", 0.0,
+            1e6, default=0.0, written=False, option=Option("--absorption", "PER_MM", BOTH))
+    roughness: float = setting("standard deviation of the exit's microfacet slopes along an axis, mm per mm", low=0.0, high=1.0,
+            default=0.0, written=False, option=Option("--roughness", "SLOPE", BOTH))
+    mirror: bool = setting("the surface is a mirror, with the screen on the source's side, beside its light", default=False,
+            written=False, option=Option("--mirror"))
+    aperture: str = setting("shape of the lens: rectangle, or circle, the largest within size", choices=("rectangle", "circle"),
+            default="rectangle", written=False, option=Option("--aperture", "rectangle|circle"))
+    border: float = setting("width of a mounting rim around the aperture in exported solids", "mm", 0.0, 1e6, default=0.0,
+            written=False, option=Option("--border", "MM"))
+    array: Wholes = setting("lenslets along x and y, each of which projects the whole picture", low=1, high=100, default=[1, 1],
+            written=False, option=Option("--array", "N[xM]"))
+    gradient: str | None = setting("gradient index of the lens: selfoc, radial or axial, with gradient_terms; volume, with an"
             " index_file; free, designed instead of the surface, between flat sides",
             choices=("selfoc", "radial", "axial", "volume", "free"), derived="homogeneous",
-            option=Option("--gradient", "selfoc|radial|axial|volume|free")),
-    Setting("lens.gradient_terms", "list", "selfoc: g of n^2 = index^2 (1 - (g r)^2), 1/mm; radial: a, b, ... of index + a r^2"
-            " + b r^4 + ...; axial: of index + a z + b z^2 + ..., z from the entrance; r and z in mm",
-            option=Option("--gradient-terms", "A[,B...]")),
-    Setting("lens.index_file", "text", "control values (n, m) or (n, m, k) of a B-spline volume of refractive index over aperture"
-            " and thickness, .npy, of which the project keeps a copy; for a free gradient, the result",
-            option=Option("--index-file", "FILE")),
-    Setting("lens.index_range", "numbers", "least and largest control value of a free gradient", low=1.0, high=5.0,
+            option=Option("--gradient", "selfoc|radial|axial|volume|free"))
+    gradient_terms: Numbers | None = setting("selfoc: g of n^2 = index^2 (1 - (g r)^2), 1/mm; radial: a, b, ... of index + a r^2 +"
+            " b r^4 + ...; axial: of index + a z + b z^2 + ..., z from the entrance; r and z in mm",
+            option=Option("--gradient-terms", "A[,B...]"))
+    index_file: str | None = setting("control values (n, m) or (n, m, k) of a B-spline volume of refractive index over aperture and"
+            " thickness, .npy, of which the project keeps a copy; for a free gradient, the result",
+            option=Option("--index-file", "FILE"), file="index")
+    index_range: Pair = setting("least and largest control value of a free gradient", low=1.0, high=5.0,
             derived="the index, 0.05 less to 0.05 more", why="the range of gradients in glass and printed polymers",
-            option=Option("--index-range", "LEAST,MOST")),
-    Setting("lens.index_control", "wholes", "control values of a free gradient along x and y", low=4, high=1024,
-            derived="two knot spans per pixel", why="as for a surface", option=Option("--index-control", "N[xM]")),
-    Setting("lens.index_layers", "whole", "control values of a free gradient along z", low=1, high=64, default=1, written=False,
-            why="in a thin blank only the integral of the index along a ray matters"),
-    Setting("lens.control", "wholes", "control points of the finished lens", low=2, high=4096,
-            derived="by picture and quality: two knot spans per pixel", why="finer than the picture, so that it is no limit",
-            option=Option("--control", "N[xM]")),
-    Setting("lens.degree", "wholes", "spline degrees, 1 to 15", low=1, high=15, default=[3, 3],
-            why="the least with continuous curvature", option=Option("--degree", "P[xQ]")),
-    Setting("lens.knots_u", "list", "knot vector on [0, 1] along x", derived="open, equispaced"),
-    Setting("lens.knots_v", "list", "knot vector on [0, 1] along y", derived="open, equispaced"),
-    # The screen
-    Setting("throw", "number", "distance from the lens' origin to the screen, in front of a mirror", "mm", -1e12, 1e12,
-            derived="300", option=Option("--throw", "MM"), speaks_for=("screen.z",)),
-    Setting("screen.z", "number", "distance from the lens' origin", "mm", *DISTANCE, default=300.0,
-            why="table D.2 of the thesis, in millimetres"),
-    Setting("screen_size", "numbers", "full width and height of the screen; a single length keeps the picture's aspect ratio", "mm",
-            derived="picture plus margin", option=Option("--screen-size", "W[xH]"), speaks_for=("screen.size",)),
-    Setting("screen.size", "numbers", "full width and height", "mm", *SCREEN, derived="picture plus margin"),
-    Setting("resolution", "wholes", "pixels of the whole screen; a single number is across, the rows follow from the aspect ratio",
-            derived="250",
-            why="table D.2 of the thesis", option=Option("--resolution", "N[xM]"), speaks_for=("screen.resolution",)),
-    Setting("screen.resolution", "wholes", "pixels along x and y", low=2, high=16384, derived="250 across"),
-    Setting("screen.tilt", "numbers", "rotation of the screen about its own centre: about the fixed x axis, then about the"
-            " fixed y axis", "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False,
-            option=Option("--screen-tilt", "A,B", BOTH)),
-    Setting("screen.shift", "numbers", "decentre of the screen; by default that of a mirror is shifted out of the light of its"
-            " source", "mm", -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH)),
-    Setting("screen.radius", "numbers", "radii of curvature of a curved screen along x and y: the same for a sphere, inf along"
-            " one axis for a cylinder; positive bends the edges towards +z, away from a lens", "mm", derived="plane", written=False,
-            option=Option("--screen-radius", "R[,RY]", BOTH)),
-    Setting("screen.shape_file", "text", "file of a screen's shape, of which the project keeps a copy: heights in mm along +z on a"
+            option=Option("--index-range", "LEAST,MOST"))
+    index_control: Wholes = setting("control values of a free gradient along x and y", low=4, high=1024,
+            derived="two knot spans per pixel", why="as for a surface", option=Option("--index-control", "N[xM]"))
+    index_layers: int = setting("control values of a free gradient along z", low=1, high=64, default=1, written=False,
+            why="in a thin blank only the integral of the index along a ray matters")
+    control: Wholes = setting("control points of the finished lens", low=2, high=4096, derived="by picture and quality: two knot"
+            " spans per pixel", why="finer than the picture, so that it is no limit", option=Option("--control", "N[xM]"))
+    degree: Wholes = setting("spline degrees, 1 to 15", low=1, high=15, default=[3, 3], why="the least with continuous curvature",
+            option=Option("--degree", "P[xQ]"))
+    knots_u: Numbers | None = setting("knot vector on [0, 1] along x", derived="open, equispaced")
+    knots_v: Numbers | None = setting("knot vector on [0, 1] along y", derived="open, equispaced")
+
+
+class ScreenSettings(Section):
+    """[screen]: the screen."""
+
+    section = "screen"
+    z: float = setting("distance from the lens' origin", "mm", *DISTANCE, default=300.0, why="table D.2 of the thesis, in"
+            " millimetres")
+    size: Pair = setting("full width and height", "mm", *SCREEN, derived="picture plus margin")
+    resolution: Wholes = setting("pixels along x and y", low=2, high=16384, derived="250 across")
+    tilt: Pair = setting("rotation of the screen about its own centre: about the fixed x axis, then about the fixed y axis",
+            "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False, option=Option("--screen-tilt", "A,B", BOTH))
+    shift: Pair = setting("decentre of the screen; by default that of a mirror is shifted out of the light of its source", "mm",
+            -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH))
+    radius: Pair | None = setting("radii of curvature of a curved screen along x and y: the same for a sphere, inf along one axis"
+            " for a cylinder; positive bends the edges towards +z, away from a lens", "mm", derived="plane", written=False,
+            option=Option("--screen-radius", "R[,RY]", BOTH))
+    shape_file: str | None = setting("file of a screen's shape, of which the project keeps a copy: heights in mm along +z on a"
             " uniform grid over the screen, borders included; a 2-D .npy [i, j] or a .tif of 32-bit floats",
-            option=Option("--screen-shape", "FILE", BOTH)),
-    # The target
-    Setting("mag", "number", "width of the picture in lens widths", low=1e-3, high=1e3, default=3.0,
-            why="table 6.1 of the thesis", option=Option("--mag")),
-    Setting("margin", "number", "total width of the dark border relative to the picture", low=0.0, high=100.0, default=0.28,
-            why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, which shows stray light",
-            option=Option("--margin")),
-    Setting("target.file", "text", "the picture, in this directory"),
-    Setting("target.size", "numbers", "width and height of the picture on the screen", "mm", *SCREEN,
-            derived="mag times the lens' width"),
-    Setting("target.encoding", "text", "encoding of the picture's values: srgb, or linear (irradiance)", choices=("srgb", "linear"),
-            default="srgb", why="the encoding of image files", option=Option("--linear", constant="linear")),
-    Setting("target.flip", "text", "mirror the picture along x, y or xy, for a viewer on the lens' side; empty for none",
-            choices=("", "x", "y", "xy"), default="", option=Option("--flip", "x|y|xy")),
-    Setting("target.sheet", "flag", "the picture is a contact sheet with a separate picture for each lenslet of an"
-            " array", default=False, written=False, option=Option("--sheet")),
-    Setting("invert", "flag", "invert the picture, for drawings in black on white or on a transparent background",
-            default=False, option=Option("--invert")),
-    Setting("target.color", "flag", "three colour channels (611, 549, 464 nm), with the glass' index for each", default=False,
-            written=False, option=Option("--color")),
-    # The second target, behind the picture: the lens then has two free-form sides
-    Setting("second.file", "text", "second picture, formed by the same light on a screen farther away; in this directory",
-            option=Option("--second", "PICTURE")),
-    Setting("second.z", "number", "distance of that screen from the lens' origin", "mm", *DISTANCE,
-            option=Option("--second-at", "MM")),
-    Setting("second.size", "numbers", "width and height of that picture", "mm", *SCREEN,
-            derived="that of a beam from the lens' edge through that of the first picture", option=Option("--second-size",
-            "W[xH]")),
-    Setting("second.collimate", "flag", "collimate the light behind the picture, parallel to the axis", default=False,
-            written=False,
-            option=Option("--collimate")),
-    Setting("second.focus", "points", "focus of the light behind the picture", "mm", *DISTANCE,
-            option=Option("--focus", "X,Y,Z")),
-    # Other lenses and fold mirrors, [[element]]
-    Setting("elements", "tables", "further lens or fold mirror on the axis, with the keys of an [[element]] table:"
-            " 'lens z=-40 thickness=4 radius=50,inf glass=N-BK7', 'mirror z=150 tilt=45,0'; may be repeated, in the order in which"
-            " light reaches them", derived="none", option=Option("--element", "'TYPE KEY=VALUE...'"), speaks_for=("element",)),
-    Setting("element.type", "text", "singlet lens, or mirror, which folds the axis", choices=("lens", "mirror"),
-            derived="lens"),
-    Setting("element.z", "number", "position of its first vertex; behind a mirror measured along the folded axis", "mm", *DISTANCE),
-    Setting("element.thickness", "number", "centre thickness of a lens", "mm", 0.0, checks.LENGTH, above=True, default=4.0,
-            written=False, why="a common small lens"),
-    Setting("element.radius", "numbers", "radii of curvature of front and back, for a mirror the first only; positive if the"
-            " centre lies behind the surface, inf for flat", "mm", derived="flat"),
-    Setting("element.index", "number", "refractive index of a lens", low=1.0, high=5.0, above=True, default=1.5168, written=False,
-            why="N-BK7 at the d line"),
-    Setting("element.glass", "text", "material instead of an index, as lens.glass"),
-    Setting("element.absorption", "number", "absorption coefficient a: transmittance exp(-a t) of t mm of its glass", "1/mm", 0.0,
-            1e6, default=0.0,
-            written=False),
-    Setting("element.size", "numbers", "full width and height of its aperture", "mm", *LENS,
-            derived="that of the lens in front of it; behind it a fifth more than a straight beam to the picture needs"),
-    Setting("element.aperture", "text", "shape of its aperture: rectangle, or circle, the largest within size",
-            choices=("rectangle", "circle"), default="rectangle", written=False),
-    Setting("element.tilt", "numbers", "rotation of a mirror about x or about y", "degrees", -85.0, 85.0),
-    Setting("element.free", "text", "free-form surfaces to be designed: none, front, back or both",
-            choices=("none", "front", "back", "both"), default="none", written=False, why="stock lenses are spherical"),
-    # The design
-    Setting("quality", "text", "quality of the default stages: draft, standard or fine", choices=("draft", "standard", "fine"),
-            derived="standard, or by the time limit", option=Option("--quality")),
-    Setting("rays", "whole", "number of rays of the last default stage", low=1, high=10**12, derived="by quality",
-            option=Option("--rays", "N")),
-    Setting("design.loss", "text", "weighted sum of rms (eq. 5.2.1), rms-light (including light off the screen), throughput, light"
-            " (light off the screen), diffusion, uniformity, laplacian, curvature: 'rms-light + 0.01 laplacian'",
-            default="rms-light", why="eq. 5.2.1 alone is reduced by sending light off the screen", option=Option("--loss")),
-    Setting("design.max_slope", "number", "largest slope of the surface, mm per mm; 0 for no limit", low=0.0, default=0.0,
-            option=Option("--max-slope")),
-    Setting("design.min_radius", "number", "least radius of curvature of concave regions, such as a tool's; 0 for no limit", "mm",
-            0.0,
-            default=0.0, option=Option("--min-radius", "MM")),
-    Setting("design.optimizer", "text", "lbfgs or adam", choices=("lbfgs", "adam"), default="lbfgs",
-            why="fewest evaluations for a given error: caustic convergence, study design; adam for a network",
-            option=Option("--optimizer")),
-    Setting("design.lr", "number", "learning rate of adam", low=0.0, above=True, default=1e-3, why="table D.2 of the thesis",
-            option=Option("--lr")),
-    Setting("design.network", "text", "parametrisation of the heights: none, sparse or dense", choices=("none", "sparse", "dense"),
-            default="none", why="control heights converge fastest", option=Option("--network")),
-    Setting("design.network_layers", "whole", "hidden layers of a dense network", low=1, high=16, default=2, written=False,
-            why="three with the final tanh, as in the thesis", option=Option("--network-layers", "N")),
-    Setting("design.network_width", "whole", "neurons per hidden layer of a dense network; 0 for the number of control points",
-            low=0, high=1_000_000, default=0, written=False, why="as in the thesis", option=Option("--network-width", "N")),
-    Setting("design.activation", "text", "activation function of a dense network: tanh, relu, silu or sine", choices=("tanh",
-            "relu", "silu", "sine"),
-            default="tanh", written=False, why="as in the thesis", option=Option("--activation", "tanh|relu|silu|sine")),
-    Setting("design.over", "text", "ranges of network inputs, so that one trained network gives a lens for every value: throw,"
-            " source.x, source.y, source.z = LOW:HIGH, separated by commas", "mm", default="", written=False,
-            option=Option("--over", "KEY=LOW:HIGH[,...]")),
-    Setting("design.initial", "text", "initial parameters: zero, uniform (+-1e-4), random, or zero-last (random except for the last"
-            " layer of a network, which is zero, so that it starts at the initial surface)",
-            choices=("zero", "uniform", "random", "zero-last"), default="zero",
-            derived="zero; zero-last of a preconditioned network"),
-    Setting("design.preconditioner", "text", "none or laplacian", choices=("none", "laplacian"),
-            derived="laplacian for heights with lbfgs, and for a network trained over a range",
-            option=Option("--preconditioner", "none|laplacian")),
-    Setting("design.filter_target", "flag", "filter the target like the render", default=True,
-            why="otherwise the blur of the filter counts as an error"),
-    Setting("design.waves", "text", "refine the wave image after the ray image: auto (where diffraction matters and time allows),"
-            " on or off", choices=("auto", "on", "off"), default="auto", why="effects are simulated where a scene needs them",
-            option=Option("--waves", "auto|on|off")),
-    Setting("design.robust", "text", "file of manufacturing and alignment errors, such as examples/tolerances.toml, over which the"
-            " loss of the last stage is averaged; empty for none", default="", written=False, option=Option("--robust", "FILE")),
-    Setting("design.start", "text", "initial surface: transport (optimal transport of the light to the picture), offset (the base"
-            " sphere given by the magnification), or the lens of another project or of a file: .npz, .step or height map as"
-            " exported, .npy of heights in mm", derived="transport; offset for a network, adam, several points or a coarse net",
-            option=Option("--start", "transport|offset|PROJECT|FILE")),
-    Setting("design.iterations", "whole", "total number of iterations, including those before a resume; 0: as given by the stages",
-            low=0, high=10**9,
-            default=0, derived="as given by the stages", option=Option("--iterations")),
-    Setting("design.time_limit", "number",
-            "time limit of the whole command, at least a quarter of it for the iterations; inf for none",
-            "s", 0.0, above=True, default=math.inf,
-            option=Option("--time-limit", "SECONDS")),
-    Setting("design.checkpoint_every", "number", "time between checkpoints", "s", 0.0, above=True, default=10.0,
-            why="work lost if the process is killed; checkpoints of large nets take seconds and are written less often"),
-    Setting("design.seed", "whole", "seed of all random numbers: the same seed gives the same bytes", low=0, high=2**31 - 1,
-            default=0,
-            option=Option("--seed", common=True)),
-    Setting("design.dtype", "text", "precision of the rays: float32 or float64", choices=("float32", "float64"), default="float32",
-            why="the sampling noise exceeds its rounding errors", option=Option("--dtype", common=True)),
-    # A stage of the design
-    Setting("design.stages.source", "text", "source type in this stage, with the other keys of [source]"),
-    Setting("design.stages.control", "wholes", "control points", low=2, high=4096, derived="the lens'"),
-    Setting("design.stages.rays", "whole", "rays per iteration", low=1, high=10**12, derived="9 per pixel",
-            why="750 x 750 on 250 x 250 pixels, tables D.1 and D.2 of the thesis"),
-    Setting("design.stages.sampler", "text", "grid, lines, stratified, uniform or sobol", derived="by the source"),
-    Setting("design.stages.reconstruction", "text", "bincount, gaussian or cosine", derived="cosine"),
-    Setting("design.stages.filter_size", "wholes", "filter size in pixels, odd", derived="3 x 3"),
-    Setting("design.stages.alpha_per_mm2", "number", "alpha of the gaussian (eq. 4.4.5)", "1/mm^2"),
-    Setting("design.stages.alpha_per_pixel2", "number", "alpha of the gaussian, instead of alpha_per_mm2", "1/pixel^2"),
-    Setting("design.stages.spread", "flag",
-            "trace rays of the source's centre, and convolve the image with the source's point-spread function",
-            default=False, written=False),
-    Setting("design.stages.lenslets", "flag",
-            "array: compare the image of every lenslet with its own picture, with its share of the rays",
-            default=False, written=False),
-    Setting("design.stages.oversample", "whole",
-            "subdivide pixels for the filter by this factor, and sum them: sharper than the filter on pixels",
-            low=1, high=8, default=1),
-    Setting("design.stages.blur", "number", "blur of render and target in the loss", "pixels", 0.0, 1000.0, default=0.0),
-    Setting("design.stages.apron", "whole", "guard band: dark pixels around the screen that detect stray light", low=0, high=4096,
-            default=0),
-    Setting("design.stages.iterations", "whole", "largest number of iterations", low=0, high=10**9, default=1000,
-            why="section 6.2.1 of the thesis"),
-    Setting("design.stages.tolerance", "number",
-            "end the stage when 10 iterations reduce the loss by less than this fraction; 0: never", low=0.0,
-            high=1.0, default=0.0),
-    Setting("design.stages.waves", "list",
-            "refine the wave image at these wavelengths, if the source has none, instead of the ray image",
-            "nm", *WAVELENGTHS),
-)
+            option=Option("--screen-shape", "FILE", BOTH), file="screen")
+
+
+class TargetSettings(Section):
+    """[target]: the picture."""
+
+    section = "target"
+    file: str = setting("the picture, in this directory")
+    size: Pair = setting("width and height of the picture on the screen", "mm", *SCREEN, derived="mag times the lens' width")
+    encoding: str = setting("encoding of the picture's values: srgb, or linear (irradiance)", choices=("srgb", "linear"),
+            default="srgb", why="the encoding of image files", option=Option("--linear", constant="linear"))
+    flip: str = setting("mirror the picture along x, y or xy, for a viewer on the lens' side; empty for none",
+            choices=("", "x", "y", "xy"), default="", option=Option("--flip", "x|y|xy"))
+    sheet: bool = setting("the picture is a contact sheet with a separate picture for each lenslet of an array", default=False,
+            written=False, option=Option("--sheet"))
+    color: bool = setting("three colour channels (611, 549, 464 nm), with the glass' index for each", default=False, written=False,
+            option=Option("--color"))
+
+
+class SecondSettings(Section):
+    """[second]: the second target, behind the picture: the lens then has two free-form sides."""
+
+    section = "second"
+    file: str | None = setting("second picture, formed by the same light on a screen farther away; in this directory",
+            option=Option("--second", "PICTURE"), file="second")
+    z: float = setting("distance of that screen from the lens' origin", "mm", *DISTANCE, option=Option("--second-at", "MM"))
+    size: Pair = setting("width and height of that picture", "mm", *SCREEN, derived="that of a beam from the lens' edge through"
+            " that of the first picture", option=Option("--second-size", "W[xH]"))
+    collimate: bool = setting("collimate the light behind the picture, parallel to the axis", default=False, written=False,
+            option=Option("--collimate"))
+    focus: Point | None = setting("focus of the light behind the picture", "mm", *DISTANCE, option=Option("--focus", "X,Y,Z"))
+
+
+class ElementSettings(Section):
+    """[[element]]: another lens or a fold mirror."""
+
+    section = "element"
+    type: str = setting("singlet lens, or mirror, which folds the axis", choices=("lens", "mirror"), derived="lens")
+    z: float = setting("position of its first vertex; behind a mirror measured along the folded axis", "mm", *DISTANCE)
+    thickness: float = setting("centre thickness of a lens", "mm", 0.0, checks.LENGTH, above=True, default=4.0, written=False,
+            why="a common small lens")
+    radius: Pair | None = setting("radii of curvature of front and back, for a mirror the first only; positive if the centre lies"
+            " behind the surface, inf for flat", "mm", derived="flat")
+    index: float = setting("refractive index of a lens", low=1.0, high=5.0, above=True, default=1.5168, written=False,
+            why="N-BK7 at the d line")
+    glass: str | None = setting("material instead of an index, as lens.glass")
+    absorption: float = setting("absorption coefficient a: transmittance exp(-a t) of t mm of its glass", "1/mm", 0.0, 1e6,
+            default=0.0, written=False)
+    size: Pair = setting("full width and height of its aperture", "mm", *LENS, derived="that of the lens in front of it; behind it"
+            " a fifth more than a straight beam to the picture needs")
+    aperture: str = setting("shape of its aperture: rectangle, or circle, the largest within size", choices=("rectangle", "circle"),
+            default="rectangle", written=False)
+    tilt: Pair | None = setting("rotation of a mirror about x or about y", "degrees", -85.0, 85.0)
+    free: str = setting("free-form surfaces to be designed: none, front, back or both", choices=("none", "front", "back", "both"),
+            default="none", written=False, why="stock lenses are spherical")
+
+
+class StageSettings(Section):
+    """[[design.stages]]: a stage of the design."""
+
+    section = "design.stages"
+    source: str | None = setting("source type in this stage, with the other keys of [source]")
+    control: Wholes = setting("control points", low=2, high=4096, derived="the lens'")
+    rays: int = setting("rays per iteration", low=1, high=10**12, derived="9 per pixel", why="750 x 750 on 250 x 250 pixels, tables"
+            " D.1 and D.2 of the thesis")
+    sampler: str = setting("grid, lines, stratified, uniform or sobol", derived="by the source")
+    reconstruction: str = setting("bincount, gaussian or cosine", derived="cosine")
+    filter_size: Wholes = setting("filter size in pixels, odd", derived="3 x 3")
+    alpha_per_mm2: float | None = setting("alpha of the gaussian (eq. 4.4.5)", "1/mm^2")
+    alpha_per_pixel2: float | None = setting("alpha of the gaussian, instead of alpha_per_mm2", "1/pixel^2")
+    spread: bool = setting("trace rays of the source's centre, and convolve the image with the source's point-spread function",
+            default=False, written=False)
+    lenslets: bool = setting("array: compare the image of every lenslet with its own picture, with its share of the rays",
+            default=False, written=False)
+    oversample: int = setting("subdivide pixels for the filter by this factor, and sum them: sharper than the filter on pixels",
+            low=1, high=8, default=1)
+    blur: float = setting("blur of render and target in the loss", "pixels", 0.0, 1000.0, default=0.0)
+    apron: int = setting("guard band: dark pixels around the screen that detect stray light", low=0, high=4096, default=0)
+    iterations: int = setting("largest number of iterations", low=0, high=10**9, default=1000, why="section 6.2.1 of the thesis")
+    tolerance: float = setting("end the stage when 10 iterations reduce the loss by less than this fraction; 0: never", low=0.0,
+            high=1.0, default=0.0)
+    waves: Numbers | None = setting("refine the wave image at these wavelengths, if the source has none, instead of the ray image",
+            "nm", *WAVELENGTHS)
+
+
+class DesignSettings(Section):
+    """[design]: the design."""
+
+    section = "design"
+
+    @property
+    def stages(self) -> tuple[StageSettings, ...]:
+        """The [[design.stages]]."""
+        return self.get("stages", ())
+
+    loss: str = setting("weighted sum of rms (eq. 5.2.1), rms-light (including light off the screen), throughput, light (light off"
+            " the screen), diffusion, uniformity, laplacian, curvature: 'rms-light + 0.01 laplacian'", default="rms-light",
+            why="eq. 5.2.1 alone is reduced by sending light off the screen", option=Option("--loss"))
+    max_slope: float = setting("largest slope of the surface, mm per mm; 0 for no limit", low=0.0, default=0.0,
+            option=Option("--max-slope"))
+    min_radius: float = setting("least radius of curvature of concave regions, such as a tool's; 0 for no limit", "mm", 0.0,
+            default=0.0, option=Option("--min-radius", "MM"))
+    optimizer: str = setting("lbfgs or adam", choices=("lbfgs", "adam"), default="lbfgs", why="fewest evaluations for a given"
+            " error: caustic convergence, study design; adam for a network", option=Option("--optimizer"))
+    lr: float = setting("learning rate of adam", low=0.0, above=True, default=1e-3, why="table D.2 of the thesis",
+            option=Option("--lr"))
+    network: str = setting("parametrisation of the heights: none, sparse or dense", choices=("none", "sparse", "dense"),
+            default="none", why="control heights converge fastest", option=Option("--network"))
+    network_layers: int = setting("hidden layers of a dense network", low=1, high=16, default=2, written=False,
+            why="three with the final tanh, as in the thesis", option=Option("--network-layers", "N"))
+    network_width: int = setting("neurons per hidden layer of a dense network; 0 for the number of control points", low=0,
+            high=1_000_000, default=0, written=False, why="as in the thesis", option=Option("--network-width", "N"))
+    activation: str = setting("activation function of a dense network: tanh, relu, silu or sine",
+            choices=("tanh", "relu", "silu", "sine"), default="tanh", written=False, why="as in the thesis",
+            option=Option("--activation", "tanh|relu|silu|sine"))
+    over: str = setting("ranges of network inputs, so that one trained network gives a lens for every value: throw, source.x,"
+            " source.y, source.z = LOW:HIGH, separated by commas", "mm", default="", written=False,
+            option=Option("--over", "KEY=LOW:HIGH[,...]"))
+    initial: str = setting("initial parameters: zero, uniform (+-1e-4), random, or zero-last (random except for the last layer of a"
+            " network, which is zero, so that it starts at the initial surface)",
+            choices=("zero", "uniform", "random", "zero-last"), default="zero", derived="zero; zero-last of a preconditioned"
+            " network")
+    preconditioner: str = setting("none or laplacian", choices=("none", "laplacian"), derived="laplacian for heights with lbfgs,"
+            " and for a network trained over a range", option=Option("--preconditioner", "none|laplacian"))
+    filter_target: bool = setting("filter the target like the render", default=True, why="otherwise the blur of the filter counts"
+            " as an error")
+    waves: str = setting("refine the wave image after the ray image: auto (where diffraction matters and time allows), on or off",
+            choices=("auto", "on", "off"), default="auto", why="effects are simulated where a scene needs them",
+            option=Option("--waves", "auto|on|off"))
+    robust: str = setting("file of manufacturing and alignment errors, such as examples/tolerances.toml, over which the loss of the"
+            " last stage is averaged; empty for none", default="", written=False, option=Option("--robust", "FILE"),
+            file="tolerances")
+    start: str = setting("initial surface: transport (optimal transport of the light to the picture), offset (the base sphere given"
+            " by the magnification), or the lens of another project or of a file: .npz, .step or height map as exported, .npy of"
+            " heights in mm", derived="transport; offset for a network, adam, several points or a coarse net",
+            option=Option("--start", "transport|offset|PROJECT|FILE"))
+    iterations: int = setting("total number of iterations, including those before a resume; 0: as given by the stages", low=0,
+            high=10**9, default=0, derived="as given by the stages", option=Option("--iterations"))
+    time_limit: float = setting("time limit of the whole command, at least a quarter of it for the iterations; inf for none", "s",
+            0.0, above=True, default=math.inf, option=Option("--time-limit", "SECONDS"))
+    checkpoint_every: float = setting("time between checkpoints", "s", 0.0, above=True, default=10.0, why="work lost if the process"
+            " is killed; checkpoints of large nets take seconds and are written less often")
+    seed: int = setting("seed of all random numbers: the same seed gives the same bytes", low=0, high=2**31 - 1, default=0,
+            option=Option("--seed", common=True))
+    dtype: str = setting("precision of the rays: float32 or float64", choices=("float32", "float64"), default="float32",
+            why="the sampling noise exceeds its rounding errors", option=Option("--dtype", common=True))
+
+
+class Parameters(Section):
+    """Parameters from which settings are derived, and which are not stored in a project.
+
+    Raises:
+        InputError: one is out of range.
+    """
+
+    def __init__(self, *given: Mapping[str, Any], **values: Any):
+        super().__init__(*given, **values)
+        for key in {"mag", "margin", "throw", "quality", "rays"} & {*self}:
+            check(key, self[key])
+
+    throw: float | None = setting("distance from the lens' origin to the screen, in front of a mirror", "mm", -1e12, 1e12,
+            derived="300", option=Option("--throw", "MM"), speaks_for=("screen.z",), before="screen.z")
+    screen_size: Pair | None = setting("full width and height of the screen; a single length keeps the picture's aspect ratio",
+            "mm", derived="picture plus margin", option=Option("--screen-size", "W[xH]"), speaks_for=("screen.size",),
+            before="screen.size")
+    resolution: Wholes | None = setting("pixels of the whole screen; a single number is across, the rows follow from the aspect"
+            " ratio", derived="250", why="table D.2 of the thesis", option=Option("--resolution", "N[xM]"),
+            speaks_for=("screen.resolution",), before="screen.resolution")
+    mag: float = setting("width of the picture in lens widths", low=1e-3, high=1e3, default=3.0, why="table 6.1 of the thesis",
+            option=Option("--mag"), before="target.file")
+    margin: float = setting("total width of the dark border relative to the picture", low=0.0, high=100.0, default=0.28,
+            why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, which shows stray light", option=Option("--margin"),
+            before="target.file")
+    invert: bool = setting("invert the picture, for drawings in black on white or on a transparent background", default=False,
+            option=Option("--invert"), before="target.color")
+    elements: Tables | None = setting("further lens or fold mirror on the axis, with the keys of an [[element]] table: 'lens z=-40"
+            " thickness=4 radius=50,inf glass=N-BK7', 'mirror z=150 tilt=45,0'; may be repeated, in the order in which light"
+            " reaches them", derived="none", option=Option("--element", "'TYPE KEY=VALUE...'"), speaks_for=("element",),
+            before="element.type")
+    quality: str | None = setting("quality of the default stages: draft, standard or fine", choices=("draft", "standard", "fine"),
+            derived="standard, or by the time limit", option=Option("--quality"), before="design.loss")
+    rays: int | None = setting("number of rays of the last default stage", low=1, high=10**12, derived="by quality",
+            option=Option("--rays", "N"), before="design.loss")
 # fmt: on
-TABLE: dict[str, Setting] = {row.path: row for row in _ROWS}
+SECTIONS: tuple[type[Section], ...] = (SourceSettings, LensSettings, ScreenSettings, TargetSettings, SecondSettings)
+SECTIONS += (ElementSettings, DesignSettings, StageSettings)
+
+
+def _listed() -> Iterator[Setting]:
+    """All rows in the order of the sections, each parameter before the setting it determines."""
+    parameters = [row for row in vars(Parameters).values() if isinstance(row, Setting)]
+    for section in SECTIONS:
+        for row in vars(section).values():
+            if isinstance(row, Setting):
+                yield from (parameter for parameter in parameters if parameter.before == row.path)
+                yield row
+
+
+TABLE: dict[str, Setting] = {row.path: row for row in _listed()}
 
 
 def check(path: str, value: Any) -> Any:
@@ -408,15 +535,14 @@ def check_all(section: str, of: object, *keys: str) -> None:
 
 def default(path: str) -> Any:
     """The default of a setting; pairs as tuples."""
-    value = TABLE[path].default
-    return tuple(value) if isinstance(value, list) else value
+    return _frozen(TABLE[path].default)
 
 
 def in_section(section: str) -> dict[str, Setting]:
     """The settings of a section, by key."""
-    return {row.key: row for row in _ROWS if row.section == section}
+    return {row.key: row for row in TABLE.values() if row.section == section}
 
 
 def options_of(command: str) -> Iterator[Setting]:
     """The settings that are options of a command, in the table's order."""
-    return (row for row in _ROWS if row.option and not row.option.common and command in row.option.commands)
+    return (row for row in TABLE.values() if row.option and not row.option.common and command in row.option.commands)

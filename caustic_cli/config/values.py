@@ -44,7 +44,7 @@ def _refuse(path: str, value: Any) -> None:
         NAMES[path](value)
 
 
-def refuse_bad_file(path: Path, parameters: bool = False) -> settings.Settings:
+def refuse_bad_file(path: Path, parameters: bool = False) -> settings.Given:
     """The settings of a TOML file, each of them valid by itself.
 
     Raises:
@@ -94,7 +94,7 @@ NAMES: dict[str, Callable[[str], Any]] = {
 #: Checks of files that options name.  Those named in a configuration or a project are relative to its directory, or not needed any
 #: more.
 FILES: dict[str, Callable[[str], Any]] = {
+    **{row.path: _existing for row in TABLE.values() if row.file and row.option and row.default is None},
     "design.start": _start,
     "design.robust": lambda value: tolerances.read(Path(value)),
-    **dict.fromkeys(("source.file", "screen.shape_file", "lens.index_file", "second.file"), _existing),
 }

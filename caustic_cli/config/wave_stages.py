@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from caustic_cli.config.default_stages import LEAST_WAVES, Table, on_waves, wave_refinement
-from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen, build_source, elements_of, value_of
+from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen, build_source
 from caustic_cli.errors import InputError
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Scene, Source
@@ -16,48 +16,46 @@ def without_waves(s: Settings, given: bool) -> str:
 
     given: whether the stages are user-defined.
     """
-    design = s["design"]
-    if any(stage.get("waves") for stage in design["stages"]):
+    if any(stage.waves for stage in s.design.stages):
         return ""
     if given:
         return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
-    if (seen := _resolution(s, build_source(s))).source > seen.pixel:
+    if (seen := _resolution(s, build_source(s.source))).source > seen.pixel:
         return "that of a source whose blur is wider than a pixel takes many times as long; ⟨waves⟩ on refines it all the same"
     return _not_by_default(s) or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; ⟨waves⟩ on takes it"
 
 
 def _not_by_default(s: Settings) -> str:
     """The feature for which `waves = "auto"` never refines the wave image, and how to include it; "" if there is none."""
-    design = s["design"]
-    if "gradient" in s["lens"]:
+    if "gradient" in s.lens:
         return "wave images are implemented for homogeneous lenses only"
-    if elements_of(s):
+    if s.elements:
         return "wave images are implemented for a single lens only"
-    if s["source"]["type"] == "rays":
+    if s.source.type == "rays":
         return "a ray file contains no phase"
-    if s["source"].get("also"):
+    if s.source.also:
         return "light of several sources is refined by rays alone"
-    if design["network"] != "none":
+    if s.design.network != "none":
         return "a network is trained on rays alone; ⟨network⟩ none refines it"
-    if design["optimizer"] != "lbfgs":
-        return f"{design['optimizer']} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it"
-    if build_screen(s).curved:
+    if s.design.optimizer != "lbfgs":
+        return f"{s.design.optimizer} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it"
+    if build_screen(s.screen).curved:
         return "a curved screen has no wave image"
-    if max(value_of(s["lens"], "lens.array")) > 1:
+    if max(s.lens.array) > 1:
         return "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on refines it"
-    if any(s["screen"].get("tilt", ())):
+    if any(s.screen.tilt):
         return "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same"
     return ""
 
 
 def wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Table]:
     """Stages that refine the wave image after the ray image, on request or where diffraction matters."""
-    design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
+    lens, screen, asked = s.lens, s.screen, s.design.waves
     without = {
-        " needs network none: the wave image is refined by control heights": design["network"] != "none",
+        " needs network none: the wave image is refined by control heights": s.design.network != "none",
         " needs a homogeneous lens: with a gradient index there is no wave image": "gradient" in lens,
         ": a ray file contains no phase, so that it has no wave image to refine": source.rays is not None,
-        " needs a plane screen: a curved one has no wave image to refine": build_screen(s).curved,
+        " needs a plane screen: a curved one has no wave image to refine": build_screen(screen).curved,
         " needs one source: light of several is refined by rays alone": len(source.members) > 1,
     }
     if asked == "on" and (why := [words for words, found in without.items() if found]):
@@ -67,22 +65,23 @@ def wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, flo
     seen = _resolution(s, source)
     if asked == "auto" and (seen.source > seen.pixel or not seen.matters):
         return []
-    own = s["source"].get("wavelengths", [])
+    own = s.source.get("wavelengths", ())
     plan = wave_refinement(_wave_samples(s, seen, lit), len(own), quality, timed=asked == "auto")
-    apron = math.ceil(0.04 * max(screen["resolution"]))
-    return [on_waves(lens["control"], list(map(float, own)) or white(count), apron, n) for count, n in plan]
+    apron = math.ceil(0.04 * max(screen.resolution))
+    return [on_waves(lens.control, list(map(float, own)) or white(count), apron, n) for count, n in plan]
 
 
 def _resolution(s: Settings, source: Source) -> Resolution:
     """The resolution limit of complete settings."""
-    return Resolution.before(Scene(source, build_lens(s), build_screen(s), build_light(s)), tuple(s["target"]["size"]))
+    scene = Scene(source, build_lens(s.lens), build_screen(s.screen), build_light(s))
+    return Resolution.before(scene, s.target.size)
 
 
 def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
     """Estimated number of samples of the field at one wavelength: space-bandwidth product of the lens and the blurred bright
     region."""
-    throw, shortest = abs(s["screen"]["z"]), min(s["source"].get("wavelengths", []) or BAND[:1]) * 1e-6
+    throw, shortest = abs(s.screen.z), min(s.source.get("wavelengths", ()) or BAND[:1]) * 1e-6
     return math.prod(
         w * (part * t + 4.0 * seen.diffraction) / (shortest * throw)
-        for w, t, part in zip(s["lens"]["size"], s["target"]["size"], lit, strict=True)
+        for w, t, part in zip(s.lens.size, s.target.size, lit, strict=True)
     )

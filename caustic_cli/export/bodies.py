@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import singledispatch
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from caustic_cli.optics.frames import AxisSegment, Pose, rotate_to_global, to_gl
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import fixed_surface, freeform_of
-from caustic_cli.scene import Component, FreeForm, Lens, Scene
+from caustic_cli.scene import Component, FoldMirror, FreeForm, Lens, Scene
 from caustic_cli.scene.elements import PLATE, SIDES
 
 #: Spline of a sphere: degree, first and largest number of control points along an axis, and largest deviation, mm.
@@ -60,12 +61,7 @@ def bodies(scene: Scene) -> Iterator[Body]:
     leg = AxisSegment()
     for number, component in enumerate(scene.elements):
         entrance = _side(component, "front")
-        if component.mirror:
-            most = float(entrance.heights.max())
-            exit = _constant(max(0.0, most) + PLATE)
-        else:
-            exit = _side(component, "back")
-            exit = FreeForm(exit.heights + component.thickness, exit.degree, exit.knots)
+        exit = _back(component, entrance)
         surface = fixed_surface(exit, component.half_size)
         lens = Lens(
             component.size,
@@ -79,7 +75,19 @@ def bodies(scene: Scene) -> Iterator[Body]:
         )
         pose = leg.pose(component.z, component.tilt)
         yield Body(component, number, lens, surface.field, surface.heights, pose)
-        leg = leg.folded(component.z, component.tilt) if component.mirror else leg
+        leg = component.axis_behind(leg)
+
+
+@singledispatch
+def _back(component: Component, entrance: FreeForm) -> FreeForm:
+    """The back of a solid behind its entrance, with heights from the first vertex, mm: of a lens its second surface."""
+    exit = _side(component, "back")
+    return FreeForm(exit.heights + component.thickness, exit.degree, exit.knots)
+
+
+@_back.register(FoldMirror)
+def _(component: FoldMirror, entrance: FreeForm) -> FreeForm:
+    return _constant(max(0.0, float(entrance.heights.max())) + PLATE)
 
 
 def _side(component: Component, side: str) -> FreeForm:
@@ -99,8 +107,7 @@ def _side(component: Component, side: str) -> FreeForm:
         line = [torch.linspace(-h, h, 4 * count + 1, dtype=torch.float64) for h in component.half_size]
         fine = [0.5 * (c / h + 1.0) for c, h in zip(line, component.half_size, strict=True)]
         off = (space.matrix(fine[0]) @ net @ space.matrix(fine[1]).T - _sag(sphere, *line)).abs()
-        if component.round:
-            off = off[line[0][:, None].square() + line[1][None, :].square() <= component.half_size[0] ** 2]
+        off = off[component.opening.contains(line[0][:, None], line[1][None, :])]
         if float(off.max()) <= CLOSE:
             return freeform_of(field, net)
         count *= 2

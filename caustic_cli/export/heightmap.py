@@ -192,5 +192,5 @@ def _said(part: Part, counts: Counts, name: str) -> dict:
         "z_of_flat_face": part.lens.z_in,
         "turned": part.turned,
         "to_the_scene": "(x, -y, -z)" if part.turned else "(x, y, z)",
-        "round": part.lens.round,
+        "round": part.lens.opening.round,
     } | ({"spline": spline} if enough else {})

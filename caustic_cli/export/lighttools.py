@@ -23,11 +23,11 @@ from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export import reading
 from caustic_cli.export.reading import Readings
-from caustic_cli.export.surface import Sampling, sample_grid, samplings
+from caustic_cli.export.surface import Sampling, control_points, sample_grid, samplings
 from caustic_cli.io.files import MARK, atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.scene import Lens, Light, Scene, Screen, Source
+from caustic_cli.scene import Aperture, Lens, Light, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 
 FORMAT_VERSION = 1
@@ -72,8 +72,6 @@ def write_lighttools(
     if rounding:
         points[:, 2] = _multiples(points[:, 2], QUANTUM)
         normals = _multiples(normals, NORMAL_QUANTUM)
-    x, y = (c.numpy() for c in field.control_xy())
-    x, y = np.broadcast_arrays(x[:, None], y[None, :])
     arrays = {
         "points": np.asfortranarray(points),
         "normals": np.asfortranarray(normals),
@@ -89,12 +87,10 @@ def write_lighttools(
         "resolution": np.array(scene.screen.resolution, np.int64),
         **_screen(scene.screen),
         **_source(scene),
-        **({"aperture": np.array("circle")} if scene.lens.round else {}),
-        **({"mirror": np.array(1, np.int64)} if scene.lens.mirror else {}),
-        **({} if scene.lens.fresnel == "exact" else {"fresnel": np.array(scene.lens.fresnel)}),
+        **{key: np.array(value) for key, value, usual in _unusual(scene.lens) if value != usual},
         **_glass(scene.lens),
         **_light(scene.light),
-        "control_points": np.asfortranarray(np.stack([x, y, net], -1)),
+        "control_points": np.asfortranarray(control_points(field, net)),
         "degrees": np.array([s.degree for s in field.spaces], np.int64),
         "knots_u": field.spaces[0].knots.numpy(),
         "knots_v": field.spaces[1].knots.numpy(),
@@ -104,6 +100,11 @@ def write_lighttools(
         "format_version": np.array(FORMAT_VERSION, np.int64),
         "created_by": np.array(f"caustic {__version__}"),
     }
+    _write(path, arrays)
+
+
+def _write(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write the archive of these arrays, in their order."""
     with atomic_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
         for name, array in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy")  # dated 1980-01-01
@@ -150,6 +151,11 @@ def _multiples(values: np.ndarray, quantum: float) -> np.ndarray:
     return np.rint(values / quantum) * quantum
 
 
+def _unusual(lens: Lens) -> tuple[tuple[str, str | np.int64, str | int], ...]:
+    """Optional keys of the lens, and the values with which they are left out."""
+    return ("aperture", lens.aperture, Aperture.name), ("mirror", np.int64(lens.mirror), 0), ("fresnel", lens.fresnel, "exact")
+
+
 def _glass(lens: Lens) -> dict[str, np.ndarray]:
     """Optional keys of the glass: absorption, 1/mm; roughness, RMS slope; glass, name of the material."""
     found = {key: _reals(getattr(lens, key)) for key in ("absorption", "roughness") if getattr(lens, key)}
@@ -172,11 +178,9 @@ def _entrance(scene: Scene) -> dict[str, np.ndarray]:
     if scene.lens.entrance is None:
         return {}
     front = entrance_of(scene.lens)
-    x, y = (c.numpy() for c in front.field.control_xy())
-    x, y = np.broadcast_arrays(x[:, None], y[None, :])
     u, v = front.field.spaces
     return {
-        "entrance_control_points": np.stack([x, y, front.heights.numpy() + scene.lens.z_in], -1),
+        "entrance_control_points": control_points(front.field, front.heights.numpy() + scene.lens.z_in),
         "entrance_degrees": np.array([u.degree, v.degree], np.int64),
         "entrance_knots_u": u.knots.numpy(),
         "entrance_knots_v": v.knots.numpy(),
@@ -254,7 +258,7 @@ def _of_plane(scene: Scene) -> dict[str, np.ndarray]:
 
 def _of_points(scene: Scene) -> dict[str, np.ndarray]:
     source, lens = scene.source, scene.lens
-    return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round))), **_intensity(source)}
+    return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.pupil))), **_intensity(source)}
 
 
 def _intensity(source: Source) -> dict[str, np.ndarray]:
@@ -277,7 +281,7 @@ def _of_rays(scene: Scene) -> dict[str, np.ndarray]:
     """Keys of a ray file, which is not included: the cone about the point where its rays are closest to each other, and
     `source_rays_sha256`, by which the file is recognised."""
     source, lens = scene.source, scene.lens
-    cone = _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round)))
+    cone = _reals(np.degrees(source.cone_over(lens.pupil)))
     return {"cone_half_angle": cone, "source_rays_sha256": np.array(source.rays.digest)}
 
 

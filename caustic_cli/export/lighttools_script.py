@@ -169,7 +169,7 @@ def refuse(scene: Scene) -> None:
         )
     if source.extent[0] != source.extent[1]:
         raise InputError("⟨script⟩: its disc is round, so an elliptical one cannot be written")
-    if scene.lens.round:
+    if scene.lens.opening.round:
         raise InputError("⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written")
 
 

@@ -3,61 +3,33 @@ above its surface up to z_in.
 
 Vertices are counter-clockwise seen from outside.  Used by the mesh formats (STL, PLY, OBJ).
 
-The exit surface is a patch of nx x ny points.  For a circular aperture the square lattice (a, b) is mapped to the disc by the
-concentric map of P. Shirley and K. Chiu (J. Graphics Tools 2(3), 1997): concentric squares become circles,
-
-    where |a| >= |b|:  (x, y) = r a (cos t, sin t), t = pi b / (4 a);   elsewhere with x and a exchanged for y and b.
-
-Its edges and shorter diagonals are at most STRETCH steps long.  The error of a triangle with edges up to L is at most L^2 |D2z| /
-6.
-
-A border, for the mount, is a flange around the aperture, half as high as the lowest point of the rim.
+The exit surface is a patch of nx x ny points, see `lattice`.  A border, for the mount, is a flange around the aperture, half as
+high as the lowest point of the rim.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from caustic_cli.config import checks
 from caustic_cli.errors import InputError
 from caustic_cli.export.bodies import Body, bodies
-from caustic_cli.export.reading import Readings, of_facets, of_vertices, spline_through
-from caustic_cli.export.surface import (
-    MAX_POINTS,
-    MAX_SAMPLES,
-    STEPS_PER_SPAN,
-    Sampling,
-    counts_of,
-    grid_within,
-    sample_grid,
-    samplings,
-    second_derivative_bounds,
-)
+from caustic_cli.export.lattice import LATTICES, Patch, triangles
+from caustic_cli.export.reading import Readings
+from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling, counts_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import entrance_of, freeform_of
+from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Lens, Scene
 
-STRETCH = 1.28
 #: Approximate bytes of walls and entrances in a mesh file.
 BESIDE = 1e6
 #: Most points along an axis of the mesh of another element's sphere.
 SPHERE = 401
 #: Height of the flange over the least height of the rim.
 FLANGE = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Patch:
-    """The exit surface's points (nx, ny, 3) mm and unit normals towards +z (nx, ny, 3), float64, counter-clockwise from +z."""
-
-    points: np.ndarray
-    normals: np.ndarray
 
 
 def closed_mesh(
@@ -102,11 +74,7 @@ def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float, a_p
         designed += density is None
         beside += 0 if density is None else 2 * math.prod(counts_of(body.field.spaces, density)) * a_point
     most = max(4.0, (limit - beside) / a_point / designed)
-    if not scene.lens.round:
-        return [{"samples": s} for s in samplings(field.spaces, most)]
-    found = [max(counts_of(field.spaces, s)) for s in samplings(field.spaces, math.inf)]  # the lattice of a disc is a square
-    across = [n for n in found if n * n <= most] or [max(2, math.isqrt(int(most)))]
-    return [{"samples": (n, n)} for n in across]
+    return [{"samples": s} for s in LATTICES[scene.lens.aperture].choices(field.spaces, most)]
 
 
 def readings(
@@ -119,15 +87,9 @@ def readings(
 ) -> Readings:
     """The surface as read from a mesh through its vertices, and as flat facets; rounded: the points (nx, ny, 3) as written."""
     *fronts, exit = patches(scene.lens, field, heights, samples, tolerance)
-    points, round = rounded(exit.points), scene.lens.round
-    front = None
-    if fronts and not round:
-        low = rounded(fronts[0].points)
-        front = freeform_of(*spline_through(low[:, 0, 0], low[0, :, 1], low[..., 2] - scene.lens.z_in))
-    return {
-        "error": lambda: of_vertices(points, triangles(points), round, front),
-        "facet_error": lambda: of_facets(points, round, entrance=front),
-    }
+    points, lattice = rounded(exit.points), LATTICES[scene.lens.aperture]
+    front = lattice.front(rounded(fronts[0].points), scene.lens.z_in) if fronts else None
+    return {"error": lambda: lattice.smooth(points, front), "facet_error": lambda: lattice.facets(points, entrance=front)}
 
 
 def patches(
@@ -137,32 +99,21 @@ def patches(
     samples: Sampling | None = None,
     tolerance: float | None = None,
 ) -> tuple[Patch, ...]:
-    """Patches of the free-form sides of a solid, the exit last; arguments as in `closed_mesh`."""
-    if lens.entrance is None:
-        return (patch(lens, field, heights, samples, tolerance),)
-    return both_patches(lens, field, heights, samples, tolerance)
+    """Patches of the free-form sides of a solid, the exit last, with equal numbers of points; arguments as in `closed_mesh`."""
+    patch, surfaces = LATTICES[lens.aperture].patch, [(field, heights)]
+    if lens.entrance is not None:
+        entrance = entrance_of(lens)
+        surfaces.insert(0, (entrance.field, entrance.heights + lens.z_in))
+    found = [patch(*surface, samples, tolerance) for surface in surfaces]
+    shapes = {p.points.shape[:2] for p in found}
+    if len(shapes) > 1:
+        found = [patch(*surface, (max(nx for nx, _ in shapes), max(ny for _, ny in shapes))) for surface in surfaces]
+    return tuple(found)
 
 
 def solid_of(lens: Lens, *sides: Patch) -> tuple[np.ndarray, np.ndarray]:
     """Closed mesh of a solid with these free-form sides: vertices and faces."""
     return solid(sides[0].points, lens) if len(sides) == 1 else _between(*(side.points for side in sides), lens)
-
-
-def both_patches(
-    lens: Lens,
-    field: HeightField,
-    heights: Tensor,
-    samples: Sampling | None = None,
-    tolerance: float | None = None,
-) -> tuple[Patch, Patch]:
-    """Patches of the free-form entrance and the exit of a lens, with equal numbers of points; arguments as in `patch`."""
-    entrance = entrance_of(lens)
-    surfaces = (entrance.field, entrance.heights + lens.z_in), (field, heights)
-    found = [patch(lens, *surface, samples, tolerance) for surface in surfaces]
-    shapes = [p.points.shape[:2] for p in found]
-    if shapes[0] != shapes[1]:
-        found = [patch(lens, *surface, (max(s[0] for s in shapes), max(s[1] for s in shapes))) for surface in surfaces]
-    return found[0], found[1]
 
 
 def _between(low: np.ndarray, high: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
@@ -180,83 +131,6 @@ def _between(low: np.ndarray, high: np.ndarray, lens: Lens) -> tuple[np.ndarray,
     top, below = rim_of(nx, ny), nx * ny + rim_of(nx, ny)
     entrance = nx * ny + triangles(low)[:, ::-1]
     return np.concatenate([high.reshape(-1, 3), low.reshape(-1, 3)]), np.concatenate([triangles(high), walls(top, below), entrance])
-
-
-def patch(
-    lens: Lens,
-    field: HeightField,
-    heights: Tensor,
-    samples: Sampling | None = None,
-    tolerance: float | None = None,
-) -> Patch:
-    """Patch of the exit surface within the aperture; samples or tolerance as in `closed_mesh`.
-
-    Raises:
-        InputError: both are given, there are too few or too many points, or a tolerance for a round lens with creases.
-    """
-    if samples is not None and tolerance is not None:
-        raise InputError("⟨samples⟩ and ⟨tolerance⟩ both say how fine the mesh is: give one of them")
-    if lens.round:
-        return _round_patch(field, heights, _across(field, heights, samples, tolerance))
-    grid = sample_grid(field, heights, samples) if tolerance is None else grid_within(field, heights, tolerance)
-    return Patch(*(a.reshape(*grid.shape, 3) for a in (grid.points, grid.normals)))
-
-
-def _across(field: HeightField, heights: Tensor, samples: Sampling | None, tolerance: float | None) -> int:
-    """Number of points along a diameter of a round lens."""
-    if tolerance is None:
-        counts = counts_of(field.spaces, STEPS_PER_SPAN if samples is None else samples)
-        n, asked = max(checks.pair("⟨samples⟩", counts, lambda w, k: checks.whole(w, k, 2, MAX_SAMPLES))), "⟨samples⟩"
-    else:
-        checks.number("⟨tolerance⟩", tolerance, 0.0, open_low=True)
-        if (
-            any(int(torch.unique(s.knots[1:-1], return_counts=True)[1].max()) > s.degree for s in field.spaces)
-            or min(s.degree for s in field.spaces) < 2
-        ):
-            raise InputError("⟨tolerance⟩ of a round mesh needs a surface without kinks; give ⟨samples⟩")
-        xx, xy, yy = second_derivative_bounds(field, heights)
-        curvature, asked = (max(xx, yy) + xy) * STRETCH**2 / 6.0, f"⟨tolerance⟩ {tolerance:g}"
-        n = math.ceil(2.0 * max(field.half_size) * math.sqrt(curvature / tolerance)) + 1 if curvature > 0 else 2
-        n = max(n, 9)
-    if n > min(MAX_SAMPLES, math.isqrt(MAX_POINTS)):
-        raise InputError(f"{asked} must give at most {math.isqrt(MAX_POINTS)} points across a round lens, got {n}")
-    return n
-
-
-def _round_patch(field: HeightField, heights: Tensor, n: int) -> Patch:
-    line = torch.linspace(-1.0, 1.0, n, dtype=torch.float64)
-    line = 0.5 * (line - line.flip(0))  # symmetric to the last bit
-    a, b = torch.meshgrid(line, line, indexing="ij")
-    wide = a.abs() >= b.abs()
-    r, other = torch.where(wide, a, b), torch.where(wide, b, a)
-    angle = 0.25 * math.pi * other / torch.where(r == 0, torch.ones_like(r), r)
-    near, far = r * torch.cos(angle), r * torch.sin(angle)
-    x, y = (torch.where(wide, p, q) * field.half_size[0] for p, q in ((near, far), (far, near)))
-    points, normals = [], []
-    for i in range(0, n, 64):  # in strips, which bounds the memory
-        at = x[i : i + 64].reshape(-1), y[i : i + 64].reshape(-1)
-        z, zx, zy = field.at(heights, *at)
-        points.append(torch.stack([*at, z], -1))
-        normals.append(torch.nn.functional.normalize(torch.stack([-zx, -zy, torch.ones_like(z)], -1), dim=-1))
-    return Patch(*(torch.cat(parts).view(n, n, 3).numpy() for parts in (points, normals)))
-
-
-def triangles(points: np.ndarray) -> np.ndarray:
-    """Two triangles for every cell of points (nx, ny, 3), in row-major numbering, split along the shorter diagonal: (2 (nx-1)
-    (ny-1), 3).
-
-    For equal diagonals, as over a rectangle, along that from low to high x and y.
-    """
-    nx, ny = points.shape[:2]
-    number, flat = np.arange(nx * ny).reshape(nx, ny), points[..., :2]
-    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]  # corners of every cell, from +z
-    up, down = (
-        ((flat[one] - flat[two]) ** 2).sum(-1) for one, two in ((np.s_[1:, 1:], np.s_[:-1, :-1]), (np.s_[1:, :-1], np.s_[:-1, 1:]))
-    )
-    falling = (down < (1.0 - 1e-9) * up)[..., None]
-    first = np.where(falling, np.stack([a, b, d], -1), np.stack([a, b, c], -1))
-    second = np.where(falling, np.stack([b, c, d], -1), np.stack([a, c, d], -1))
-    return np.stack([first, second], 2).reshape(-1, 3)
 
 
 def rim_of(nx: int, ny: int) -> np.ndarray:
@@ -280,25 +154,28 @@ def solid(points: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: the surface reaches the entrance.
     """
-    if lens.mirror:  # built upside down and reflected in z; the order of vertices is reversed to keep the orientation
-        upside = replace(lens, mirror=False, z_in=-lens.z_in)
-        vertices, faces = solid(points * [1.0, 1.0, -1.0], upside)
-        return vertices * [1.0, 1.0, -1.0] + 0.0, faces[:, ::-1].copy()
-    refuse_open(float(points[..., 2].min()), lens.z_in)
+    up = np.array([1.0, 1.0, lens.cut_from])  # a mirror is built upside down; the order of its vertices keeps the orientation
+    vertices, faces = _under(points * up, lens, lens.cut_from * lens.z_in)
+    return vertices * up + 0.0, faces[:, :: lens.cut_from].copy()
+
+
+def _under(points: np.ndarray, lens: Lens, z_in: float) -> tuple[np.ndarray, np.ndarray]:
+    """`solid` under points above z_in, mm."""
+    refuse_open(float(points[..., 2].min()), z_in)
     nx, ny = points.shape[:2]
     numbers, vertices = rim_of(nx, ny), [points.reshape(-1, 3)]
     rim, faces, count = vertices[0][numbers], [triangles(points)], nx * ny
-    loops = [_at(rim, lens, 0.0, lens.z_in)]
+    loops = [_at(rim, lens, 0.0, z_in)]
     if lens.border > 0:
-        high = flange_height(rim, lens.z_in)
-        loops = [_at(rim, lens, 0.0, high), _at(rim, lens, lens.border, high), _at(rim, lens, lens.border, lens.z_in)]
+        high = flange_height(rim, z_in)
+        loops = [_at(rim, lens, 0.0, high), _at(rim, lens, lens.border, high), _at(rim, lens, lens.border, z_in)]
     for loop in loops:
         below = count + np.arange(len(rim))
         faces.append(walls(numbers, below))
         vertices.append(loop)
         numbers, count = below, count + len(rim)
     faces.append(np.stack([np.full_like(numbers, count), np.roll(numbers, -1), numbers], -1))
-    vertices.append(np.array([[0.0, 0.0, lens.z_in]]))
+    vertices.append(np.array([[0.0, 0.0, z_in]]))
     return np.concatenate(vertices), np.concatenate(faces)
 
 

@@ -19,8 +19,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -29,19 +31,22 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.export import mesh
 from caustic_cli.export.bodies import bodies
-from caustic_cli.export.mesh import Patch, both_patches, patches, refuse_open, rim_of, triangles, walls
+from caustic_cli.export.lattice import LATTICES, Patch, triangles
+from caustic_cli.export.mesh import patches, refuse_open, rim_of, walls
 from caustic_cli.export.ply import FACE, write_mesh
-from caustic_cli.export.reading import Readings, of_facets
+from caustic_cli.export.reading import Readings
 from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import write_bytes
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
-from caustic_cli.scene import Component, Lens, Scene, Screen
+from caustic_cli.scene import Aperture, CircularAperture, Lens, Scene, Screen
 from caustic_cli.scene.elements import surface_name
 from caustic_cli.scene.features import special_features
 
+#: Features beyond a basic scene that are written.
+WRITTEN = ("a mirror", "a shifted screen")
 #: Samples per pixel of the scene, Mitsuba's `spp`.
 SAMPLES = 256
 #: Distance of the collimated emitter before the entrance, mm; width of the holder over that of the lens.
@@ -61,18 +66,26 @@ BLACK = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
 MIRRORED = f'<bsdf type="twosided"><bsdf type="conductor"><string name="material" value="none"/></bsdf>{BLACK}</bsdf>'
 
 
-def companions(
-    path: str | Path, round: bool = True, mirror: bool = False, two_sided: bool = False, elements: Sequence[Component] = ()
-) -> list[Path]:
+class _Flat(NamedTuple):
+    """What the outline of a flat entrance decides: its shape, the black holder around it, and the holder's mesh files."""
+
+    shape: str
+    holder: Callable[[Path, Lens], list[str]]
+    files: tuple[str, ...] = ()
+
+
+def _beside(path: str | Path, name: str) -> Path:
+    """The mesh file of a part of a scene."""
+    return Path(path).with_name(f"{Path(path).stem}-{name}.ply")
+
+
+def companions(path: str | Path, scene: Scene) -> list[Path]:
     """Mesh files of a scene: exit surface, sides, holder of a round lens, free-form entrance; or mirror; and surfaces of other
     elements with their black parts."""
-    path = Path(path)
-    if mirror:
-        return [path.with_name(f"{path.stem}-mirror.ply")]
-    names = ["exit", "sides"] + ["holder"] * round + ["entrance"] * two_sided
-    for k, element in enumerate(elements):
+    names = [*_OPTICS[scene.lens.kind][0](scene)]
+    for k, element in enumerate(scene.elements):
         names += [surface_name(k, side) for side in element.sides] + [f"element-{k + 1}-black"]
-    return [path.with_name(f"{path.stem}-{name}.ply") for name in names]
+    return [_beside(path, name) for name in names]
 
 
 def write_mitsuba(
@@ -89,52 +102,69 @@ def write_mitsuba(
     Arguments as in `closed_mesh`; `dark`: without an emitter.
 
     Raises:
-        InputError: as `closed_mesh`; a source without an equivalent emitter; or the files cannot be written.
+        InputError: as `closed_mesh`; a source without an equivalent emitter; something obstructs the light of a near source, whose
+            emitter stands where the source does, on its way to a mirror; or the files cannot be written.
     """
     light = [] if dark else _light(scene)
-    *fronts, surface = patches(scene.lens, field, heights, samples, tolerance)
-    front = fronts[0] if fronts else None
-    if scene.lens.mirror:
-        _write_mirror(path, scene, surface, light)
-        return
-    if front is None:
-        refuse_open(float(surface.points[..., 2].min()), scene.lens.z_in)
-    exit_mesh, sides = companions(path, False)
-    points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
-    write_mesh(exit_mesh, points, triangles(surface.points), normals)
-    rim = points[rim_of(*surface.points.shape[:2])]
-    low = rim * [1.0, 1.0, 0.0] + [0.0, 0.0, scene.lens.z_in]
-    write_mesh(sides, *_strip(rim, low if front is None else front.points.reshape(-1, 3)[rim_of(*front.points.shape[:2])]))
-    lens, screen = scene.lens, scene.screen
-    glass, onto, surfaces = _glass(lens.index), _onto(scene), len(System.of(scene).elements)
-    rx, ry = lens.half_size
-    flat, holder = ("disk", _round_holder(path, rx, lens.z_in, BLACK)) if lens.round else ("rectangle", _holder(lens, BLACK))
-    away = 0.9 * (screen.z - max(float(points[:, 2].max()), *(e.extent[1] for e in scene.behind), -math.inf))
-    place = f'<transform name="to_world">{SPIN}<scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.z_in)}"/></transform>'
-    entrance = [f'<shape type="{flat}" id="entrance">', f"  {glass}", f"  {place}", "</shape>"]
-    if front is not None:
-        mesh = companions(path, lens.round, two_sided=True)[-1]
-        write_mesh(mesh, front.points.reshape(-1, 3), triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3))
-        entrance = [f'<shape type="ply" id="entrance"><string name="filename" value={quoteattr(mesh.name)}/>{glass}</shape>']
-    lines = [
-        *_camera(screen, away, f'<scale x="-1"/>{_moved(screen, screen.z - away)}{onto}', surfaces + 2),
-        *entrance,
-        f'<shape type="ply" id="exit"><string name="filename" value={quoteattr(exit_mesh.name)}/>{glass}</shape>',
-        f'<shape type="ply" id="sides"><string name="filename" value={quoteattr(sides.name)}/>'
-        f'<boolean name="face_normals" value="true"/>{BLACK}</shape>',
-        *holder,
-        *_others(path, scene),
-        *_screen(screen, SPIN, onto),
-        *light,
-        "</scene>",
-        "",
-    ]
+    sides = patches(scene.lens, field, heights, samples, tolerance)
+    lines = [*_OPTICS[scene.lens.kind][1](Path(path), scene, sides, light), "</scene>", ""]
     write_bytes(path, "\n".join(lines).encode())
 
 
-def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
-    """Densities of files of at most `limit` bytes in all, the smallest first."""
-    return mesh.choices(scene, field, heights, limit, A_POINT)
+def _lens_files(scene: Scene) -> list[str]:
+    """Names of the meshes of a lens."""
+    return ["exit", "sides", *_FLATS[scene.lens.aperture].files] + ["entrance"] * scene.two_sided
+
+
+def _lens(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]) -> list[str]:
+    """The scene of a lens with these free-form sides, after writing its meshes."""
+    lens, screen, (*fronts, surface) = scene.lens, scene.screen, sides
+    glass, onto, flat = _glass(lens.index), _onto(scene), _FLATS[lens.aperture]
+    points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
+    rim = points[rim_of(*surface.points.shape[:2])]
+    if fronts:
+        low, entrance = _free_entrance(path, fronts[0], glass)
+    else:
+        refuse_open(float(surface.points[..., 2].min()), lens.z_in)
+        low, entrance = rim * [1.0, 1.0, 0.0] + [0.0, 0.0, lens.z_in], _flat_entrance(lens, flat.shape, glass)
+    write_mesh(_beside(path, "exit"), points, triangles(surface.points), normals)
+    write_mesh(_beside(path, "sides"), *_strip(rim, low))
+    away = 0.9 * (screen.z - max(float(points[:, 2].max()), *(e.extent[1] for e in scene.behind), -math.inf))
+    place = f'<scale x="-1"/>{_moved(screen, screen.z - away)}{onto}'
+    return [
+        *_camera(screen, away, place, len(System.of(scene).elements) + 2),
+        *entrance,
+        f'<shape type="ply" id="exit">{_file(path, "exit")}{glass}</shape>',
+        f'<shape type="ply" id="sides">{_file(path, "sides")}<boolean name="face_normals" value="true"/>{BLACK}</shape>',
+        *flat.holder(path, lens),
+        *_others(path, scene),
+        *_screen(screen, SPIN, onto),
+        *light,
+    ]
+
+
+def _flat_entrance(lens: Lens, shape: str, glass: str) -> list[str]:
+    """A flat entrance."""
+    rx, ry = lens.half_size
+    place = f'<transform name="to_world">{SPIN}<scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.z_in)}"/></transform>'
+    return [f'<shape type="{shape}" id="entrance">', f"  {glass}", f"  {place}", "</shape>"]
+
+
+def _free_entrance(path: Path, front: Patch, glass: str) -> tuple[np.ndarray, list[str]]:
+    """Border points (k, 3) mm of a free-form entrance, and its shape, after writing its mesh."""
+    points = front.points.reshape(-1, 3)
+    write_mesh(_beside(path, "entrance"), points, triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3))
+    shape = [f'<shape type="ply" id="entrance">{_file(path, "entrance")}{glass}</shape>']
+    return points[rim_of(*front.points.shape[:2])], shape
+
+
+def _file(path: Path, name: str) -> str:
+    """Reference to the mesh of a part."""
+    return f'<string name="filename" value={quoteattr(_beside(path, name).name)}/>'
+
+
+#: Densities of files of at most `limit` bytes in all, the smallest first.
+choices = partial(mesh.choices, a_point=A_POINT)
 
 
 def readings(
@@ -142,34 +172,31 @@ def readings(
 ) -> Readings:
     """The exit as Mitsuba interpolates it: flat facets with the normals of the vertices."""
     exit = patches(scene.lens, field, heights, samples, tolerance)[-1]
-    return {"error": lambda: of_facets(exit.points, scene.lens.round, exit.normals)}
+    return {"error": lambda: LATTICES[scene.lens.aperture].facets(exit.points, exit.normals)}
 
 
-def _others(path: str | Path, scene: Scene) -> list[str]:
+def _others(path: Path, scene: Scene) -> list[str]:
     """Shapes of other lenses and mirrors: their surfaces, black sides, and a black frame around each, which stops light beside
     it."""
     lines = []
     for body in bodies(scene):
-        patches = both_patches(body.lens, body.field, body.heights)
-        black = Path(path).with_name(f"{Path(path).stem}-element-{body.number + 1}-black.ply")
-        rims = [p.points.reshape(-1, 3)[rim_of(*p.points.shape[:2])] for p in patches]
+        sides = patches(body.lens, body.field, body.heights)
+        black = f"element-{body.number + 1}-black"
+        rims = [p.points.reshape(-1, 3)[rim_of(*p.points.shape[:2])] for p in sides]
         outer = rims[0] * [FRAME, FRAME, 1.0]
         frame, around = _strip(outer, rims[0])
-        sides, across = _strip(rims[1], rims[0])
-        write_mesh(black, body.placed(np.concatenate([frame, sides])), np.concatenate([around, across + len(frame)]))
-        coating = _glass(body.component.index)
-        if body.component.mirror:
-            coating = MIRRORED
-        for side, seen in zip(body.component.sides, patches, strict=False):
+        across, down = _strip(rims[1], rims[0])
+        write_mesh(_beside(path, black), body.placed(np.concatenate([frame, across])), np.concatenate([around, down + len(frame)]))
+        coating = _COATINGS[body.component.kind](body.component.index)
+        for side, seen in zip(body.component.sides, sides, strict=False):
             name = surface_name(body.number, side)
-            mesh = Path(path).with_name(f"{Path(path).stem}-{name}.ply")
             faces, normals = triangles(seen.points), seen.normals.reshape(-1, 3)
             if side == "front":  # normals out of the glass, or towards the light
                 faces, normals = faces[:, ::-1], -normals
-            write_mesh(mesh, body.placed(seen.points.reshape(-1, 3)), faces, body.turned(normals))
-            lines.append(f'<shape type="ply" id="{name}"><string name="filename" value={quoteattr(mesh.name)}/>{coating}</shape>')
+            write_mesh(_beside(path, name), body.placed(seen.points.reshape(-1, 3)), faces, body.turned(normals))
+            lines.append(f'<shape type="ply" id="{name}">{_file(path, name)}{coating}</shape>')
         lines.append(
-            f'<shape type="ply"><string name="filename" value={quoteattr(black.name)}/>'
+            f'<shape type="ply">{_file(path, black)}'
             f'<boolean name="face_normals" value="true"/><bsdf type="twosided">{BLACK}</bsdf></shape>'
         )
     return lines
@@ -179,28 +206,24 @@ def _glass(index: float) -> str:
     return f'<bsdf type="dielectric"><float name="int_ior" value="{real(index)}"/><float name="ext_ior" value="1"/></bsdf>'
 
 
-def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[str]) -> None:
-    """Write the scene of a mirror.
+def _mirror(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]) -> list[str]:
+    """The scene of a mirror with this surface, after writing its mesh.
 
     Raises:
-        InputError: something obstructs the light of a near source, whose emitter stands where the source does.
+        InputError: something obstructs the light of a near source.
     """
-    screen, lens = scene.screen, scene.lens
+    screen, lens, surface = scene.screen, scene.lens, sides[-1]
     if not scene.source.collimated:
         refuse_obstructed(scene, designed=True)
-    (mesh,) = companions(path, False, True)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
-    write_mesh(mesh, points, triangles(surface.points)[:, ::-1], -normals)  # towards the light
+    write_mesh(_beside(path, "mirror"), points, triangles(surface.points)[:, ::-1], -normals)  # towards the light
     away = 0.9 * (min(float(points[:, 2].min()), lens.z_in) - BEFORE - screen.z)
-    lines = [
+    return [
         *_camera(screen, away, f'<rotate y="1" angle="180"/>{_moved(screen, screen.z + away)}'),
-        f'<shape type="ply" id="mirror"><string name="filename" value={quoteattr(mesh.name)}/>{MIRRORED}</shape>',
+        f'<shape type="ply" id="mirror">{_file(path, "mirror")}{MIRRORED}</shape>',
         *_screen(screen, ""),
         *(line.replace("</shape>", '<bsdf type="null"/></shape>') for line in light),
-        "</scene>",
-        "",
     ]
-    write_bytes(path, "\n".join(lines).encode())
 
 
 def _onto(scene: Scene) -> str:
@@ -260,7 +283,7 @@ def _strip(top: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([top, low]), walls(np.arange(len(top)), len(top) + np.arange(len(low)))
 
 
-def _holder(lens: Lens, black: str) -> list[str]:
+def _holder(_path: Path, lens: Lens) -> list[str]:
     """Four black rectangles around the entrance."""
     (rx, ry), wide, lines = lens.half_size, WIDE * max(lens.half_size), []
     for cx, cy, hx, hy in (
@@ -270,7 +293,7 @@ def _holder(lens: Lens, black: str) -> list[str]:
         (0, (ry + wide) / 2, rx, (wide - ry) / 2),
     ):
         lines += [
-            f'<shape type="rectangle">{black}',
+            f'<shape type="rectangle">{BLACK}',
             f'  <transform name="to_world"><scale x="{real(hx)}" y="{real(hy)}"/>'
             f'<translate x="{real(cx)}" y="{real(cy)}" z="{real(lens.z_in)}"/></transform>',
             "</shape>",
@@ -278,17 +301,23 @@ def _holder(lens: Lens, black: str) -> list[str]:
     return lines
 
 
-def _round_holder(path: str | Path, radius: float, z: float, black: str) -> list[str]:
+def _round_holder(path: Path, lens: Lens) -> list[str]:
     """A black annulus around the entrance, as a mesh of rings of growing width, since single precision misses thin triangles."""
-    angle = np.linspace(0.0, 2.0 * np.pi, RING, endpoint=False)
-    inner = np.stack([np.cos(angle), np.sin(angle), np.full_like(angle, z)], -1) * [radius, radius, 1.0]
+    angle, radius = np.linspace(0.0, 2.0 * np.pi, RING, endpoint=False), lens.half_size[0]
+    inner = np.stack([np.cos(angle), np.sin(angle), np.full_like(angle, lens.z_in)], -1) * [radius, radius, 1.0]
     inner[:, :2] /= math.cos(math.pi / RING)  # polygon circumscribed about the circle
     widths = [1.0, 1.05, 1.25, 2.0, 6.0, WIDE]
     parts = [_strip(inner * [a, a, 1.0], inner * [b, b, 1.0]) for a, b in itertools.pairwise(widths)]
     faces = np.concatenate([f + k * 2 * RING for k, (_, f) in enumerate(parts)])
-    file = companions(path, True)[2]
-    write_mesh(file, np.concatenate([v for v, _ in parts]), faces)
-    return [f'<shape type="ply" id="holder"><string name="filename" value={quoteattr(file.name)}/>{black}</shape>']
+    write_mesh(_beside(path, "holder"), np.concatenate([v for v, _ in parts]), faces)
+    return [f'<shape type="ply" id="holder">{_file(path, "holder")}{BLACK}</shape>']
+
+
+#: Flat entrances by the name of the aperture.
+_FLATS = {Aperture.name: _Flat("rectangle", _holder), CircularAperture.name: _Flat("disk", _round_holder, ("holder",))}
+#: By the kind of the lens: names of its meshes and its scene; by the kind of an element: what covers its surfaces.
+_OPTICS = {"lens": (_lens_files, _lens), "mirror": (lambda _scene: ["mirror"], _mirror)}
+_COATINGS = {"lens": _glass, "mirror": lambda _index: MIRRORED}
 
 
 def _light(scene: Scene) -> list[str]:
@@ -297,7 +326,7 @@ def _light(scene: Scene) -> list[str]:
     Raises:
         InputError: Mitsuba has no equivalent emitter.
     """
-    beyond = [name for name in special_features(scene) if name not in ("a mirror", "a shifted screen")]
+    beyond = [name for name in special_features(scene) if name not in WRITTEN]
     if beyond:
         raise InputError(f"⟨format⟩ mitsuba is written for clear lenses and straight screens, not {', '.join(beyond)}")
     if scene.source.kind not in _EMITTERS:
@@ -310,10 +339,9 @@ def _collimated(scene: Scene) -> list[str]:
     source, pupil = scene.source, scene.pupil
     if source.profile is not None:
         raise InputError("⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
-    (rx, ry), area = pupil.half_size, 4.0 * math.prod(pupil.half_size) * (math.pi / 4.0 if pupil.round else 1.0)
-    radiance = real(source.power / area)
+    (rx, ry), radiance = pupil.half_size, real(source.power / pupil.aperture.area)
     return [
-        f'<shape type="{"disk" if pupil.round else "rectangle"}" id="light">',
+        f'<shape type="{_FLATS[pupil.aperture.name].shape}" id="light">',
         f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
         f'<translate z="{real(scene.lowest - BEFORE)}"/></transform>',
         f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>',
@@ -333,7 +361,7 @@ def _area(scene: Scene) -> list[str]:
         raise InputError("⟨format⟩ mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written")
     if not min(source.size) > 0:
         raise InputError("⟨format⟩ mitsuba: its disc shines by its area, so one without any cannot be written")
-    (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(pupil.half_size, pupil.z, pupil.round)
+    (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(pupil)
     radiance = source.power / (
         math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2
     )  # the power is that within the cone that covers the lens
@@ -351,7 +379,7 @@ def _spots(scene: Scene) -> list[str]:
     source, pupil = scene.source, scene.pupil
     if source.intensity != "uniform":
         raise InputError("⟨format⟩ mitsuba: its spots shine evenly, so points of another intensity cannot be written")
-    cone = source.cone_over(pupil.half_size, pupil.z, pupil.round)
+    cone = source.cone_over(pupil)
     lines, degrees = [], math.degrees(cone)
     for (x, y, z), power in zip(source.positions, source.powers, strict=True):
         intensity = power / (4.0 * math.pi * math.sin(cone / 2.0) ** 2)

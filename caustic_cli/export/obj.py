@@ -5,46 +5,28 @@ Lengths have DECIMALS decimals: at a distance of the points of 1 um, rounding ch
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-
-from torch import Tensor
+from typing import Any
 
 from caustic_cli.export import mesh
-from caustic_cli.export.reading import Readings
-from caustic_cli.export.surface import Sampling
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_file
-from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene
 
 DECIMALS = 9
 #: Bytes of a point's three numbers and two triangles, as text, about.
 A_POINT = 3 * (DECIMALS + 4) + 2 * 25
 
 
-def write_obj(
-    path: str | Path,
-    scene: Scene,
-    field: HeightField,
-    heights: Tensor,
-    samples: Sampling | None = None,
-    tolerance: float | None = None,
-) -> None:
+def write_obj(path: str | Path, *lens: Any, **density: Any) -> None:
     """Write the solid atomically; arguments and errors as in `write_ply`."""
-    vertices, faces = mesh.closed_mesh(scene, field, heights, samples, tolerance)
+    vertices, faces = mesh.closed_mesh(*lens, **density)
     with atomic_file(path) as file:
         file.write(f"# {CREATED}\n# millimetres\no lens\n".encode())
         file.writelines(rows(vertices.round(DECIMALS) + 0.0, f"v %.{DECIMALS}f %.{DECIMALS}f %.{DECIMALS}f\n"))
         file.writelines(rows(faces + 1, "f %d %d %d\n"))
 
 
-def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
-    """Densities of files of at most `limit` bytes, the smallest first."""
-    return mesh.choices(scene, field, heights, limit, A_POINT)
-
-
-def readings(
-    scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
-) -> Readings:
-    """The surface as read from the mesh, with rounded lengths."""
-    return mesh.readings(scene, field, heights, samples, tolerance, lambda points: points.round(DECIMALS))
+#: Densities of files of at most `limit` bytes, the smallest first; and the surface as read from the mesh, with rounded lengths.
+choices = partial(mesh.choices, a_point=A_POINT)
+readings = partial(mesh.readings, rounded=lambda points: points.round(DECIMALS))

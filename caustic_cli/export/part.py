@@ -62,25 +62,28 @@ def part_of(
         InputError: the format does not support moulds, or a block is given for a lens.
     """
     lens, heights = scene.lens, heights.detach().double().cpu()
-    kind = "mould" if mould else "mirror" if lens.mirror else "lens"
-    if lens.gradient is not None and format in ONE_INDEX:
-        shapes = ", ".join(name for name in FORMATS if name not in ONE_INDEX)
-        raise InputError(f"⟨format⟩ {format} holds one index, and this lens' varies; {shapes} hold its shape alone")
-    if mould and format not in MOULDS:
-        raise InputError(f"⟨mould⟩ belongs to ⟨format⟩ {', '.join(MOULDS)}, got {format}")
-    if block is not None and kind == "lens":
-        raise InputError("⟨block⟩ belongs to mirrors and moulds: a lens ends at its flat entrance")
+    kind = "mould" if mould else lens.kind
+    _refuse(format, lens, kind, block)
     if kind == "lens":
         return Part(scene, field, heights, kind)
     room = BLOCK * max(lens.size) if block is None else block
-    above = lens.mirror != mould
-    if not above:  # the mould of a mirror
+    if (-lens.cut_from if mould else lens.cut_from) > 0:  # the mould of a mirror, with material below its surface as a lens
         return Part(_alone(scene, float(heights.min()) - room), field, heights, kind)
     if format not in AS_CUT and not mould:
         back = float(heights.max()) + room if format in SOLIDS else lens.z_in
         return Part(replace(scene, lens=replace(lens, z_in=back)) if format in SOLIDS else scene, field, heights, kind)
     field, heights = turned(field, heights)
     return Part(_alone(scene, float(heights.min()) - room), field, heights, kind, True)
+
+
+def _refuse(format: str, lens: Lens, kind: str, block: float | None) -> None:
+    if lens.gradient is not None and format in ONE_INDEX:
+        shapes = ", ".join(name for name in FORMATS if name not in ONE_INDEX)
+        raise InputError(f"⟨format⟩ {format} holds one index, and this lens' varies; {shapes} hold its shape alone")
+    if kind == "mould" and format not in MOULDS:
+        raise InputError(f"⟨mould⟩ belongs to ⟨format⟩ {', '.join(MOULDS)}, got {format}")
+    if block is not None and kind == "lens":
+        raise InputError("⟨block⟩ belongs to mirrors and moulds: a lens ends at its flat entrance")
 
 
 def turned(field: HeightField, heights: Tensor) -> tuple[HeightField, Tensor]:

@@ -7,49 +7,32 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from caustic_cli.export import mesh
-from caustic_cli.export.reading import Readings
-from caustic_cli.export.surface import Sampling
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
-from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene
 
 FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 #: Bytes of a point's three numbers and two triangles.
 A_POINT = 3 * 8 + 2 * FACE.itemsize
 
 
-def write_ply(
-    path: str | Path,
-    scene: Scene,
-    field: HeightField,
-    heights: Tensor,
-    samples: Sampling | None = None,
-    tolerance: float | None = None,
-) -> None:
+def write_ply(path: str | Path, *lens: Any, **density: Any) -> None:
     """Write the solid atomically.
 
     Arguments and errors as in `closed_mesh`; InputError also if it cannot be written.
     """
-    write_mesh(path, *mesh.closed_mesh(scene, field, heights, samples, tolerance))
+    write_mesh(path, *mesh.closed_mesh(*lens, **density))
 
 
-def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
-    """Densities of files of at most `limit` bytes, the smallest first."""
-    return mesh.choices(scene, field, heights, limit, A_POINT)
-
-
-def readings(
-    scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
-) -> Readings:
-    """The surface as read from the mesh."""
-    return mesh.readings(scene, field, heights, samples, tolerance)
+#: Densities of files of at most `limit` bytes, the smallest first; and the surface as read from the mesh.
+choices = partial(mesh.choices, a_point=A_POINT)
+readings = mesh.readings
 
 
 def write_mesh(path: str | Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = None) -> None:

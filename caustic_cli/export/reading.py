@@ -22,9 +22,8 @@ from torch import Tensor
 from caustic_cli.export.surface import SurfaceGrid
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.base import MeasuredSurface
-from caustic_cli.optics.surfaces.facets import FacetSurface, vertex_normals
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import FreeForm
+from caustic_cli.scene import Aperture, FreeForm
 
 #: Random points at which heights are compared.
 POINTS = 100_000
@@ -45,13 +44,13 @@ class Reading:
     heights: Tensor | None
     entrance: FreeForm | None = None
 
-    def largest_deviation(self, field: HeightField, heights: Tensor, round: bool = False) -> float:
-        """Largest deviation in height from a surface, control heights (n, m) mm, at random points of the aperture, mm."""
+    def largest_deviation(self, field: HeightField, heights: Tensor, aperture: Aperture) -> float:
+        """Largest deviation in height, mm, from a surface, control heights (n, m) mm, at random points of an aperture of its half
+        widths."""
         random = np.random.default_rng(SEED)
         x, y = (torch.from_numpy(random.uniform(-r, r, POINTS)) for r in field.half_size)
-        if round:
-            inside = torch.hypot(x, y) < field.half_size[0]
-            x, y = x[inside], y[inside]
+        inside = aperture.contains(x, y)
+        x, y = x[inside], y[inside]
         own, read = field.at(heights, x, y, [(0, 0)])[0], self.surface.at(self.heights, x, y, [(0, 0)])[0]  # type: ignore[arg-type]
         return float((read - own).abs().max())
 
@@ -107,18 +106,3 @@ def of_patches(grid: SurfaceGrid, z: np.ndarray, zx: np.ndarray, zy: np.ndarray,
 def of_poles(field: HeightField, poles: Tensor, entrance: FreeForm | None = None) -> Reading:
     """The spline with these poles (n, m), mm."""
     return Reading("the B-spline of these poles", field.shape, field, poles, entrance)
-
-
-def of_vertices(points: np.ndarray, faces: np.ndarray, round: bool, entrance: FreeForm | None = None) -> Reading:
-    """A mesh through its vertices, points (nx, ny, 3) mm with triangles (F, 3)."""
-    if round:
-        normals = vertex_normals(points, faces)
-        return Reading("facets with smoothed normals", points.shape[:2], FacetSurface(points, True, normals), None, entrance)
-    field, heights = spline_through(points[:, 0, 0], points[0, :, 1], points[..., 2])
-    return Reading("a bicubic spline through its vertices", points.shape[:2], field, heights, entrance)
-
-
-def of_facets(points: np.ndarray, round: bool, normals: np.ndarray | None = None, entrance: FreeForm | None = None) -> Reading:
-    """A mesh of flat facets between points (nx, ny, 3) mm, with the normals (nx, ny, 3) given at the vertices, if any."""
-    read_as = "flat facets" if normals is None else "facets with interpolated normals"
-    return Reading(read_as, points.shape[:2], FacetSurface(points, round, normals), None, entrance)

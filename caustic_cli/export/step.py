@@ -32,14 +32,13 @@ from caustic_cli.export.approximation import on_fewer_knots
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
 from caustic_cli.export.reading import Readings, of_poles
-from caustic_cli.export.surface import STEPS_PER_SPAN, decimals_for, knot_lines, on_lines
+from caustic_cli.export.surface import STEPS_PER_SPAN, control_points, decimals_for, knot_lines, on_lines
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
-from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import Pose, rotate_to_global, to_global
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of, freeform_of
-from caustic_cli.scene import Lens, Scene
+from caustic_cli.scene import Aperture, CircularAperture, Lens, Scene
 
 HEAD = f"""ISO-10303-21;
 HEADER;
@@ -61,13 +60,13 @@ ROUND_UNCERTAINTY, MOST_ON_RIM = 1e-6, 1 << 15
 class Entities:
     """Numbered STEP entities: `add` returns the reference "#7" of a new one.
 
-    mirrored: reflect z; outward normals remain outward, and loops are reversed.
+    up: -1 to reflect z; outward normals remain outward, and loops are reversed.
     decimals: of points; None for all digits.
     """
 
-    def __init__(self, mirrored: bool = False, decimals: int | None = None):
+    def __init__(self, up: float = 1.0, decimals: int | None = None):
         self.lines: list[str] = []
-        self.up = -1.0 if mirrored else 1.0
+        self.up = float(up)
         self.decimals = decimals
         self.pose = Pose()  # of the solid that is being described
 
@@ -170,18 +169,16 @@ def write_step(
     """
     solids, decimals = _solids(scene, field, heights, tolerance, poles)
     if scene.lens.entrance is None:
-        lens, exit = solids[0].lens, solids[0].heights
-        refuse_open(float(exit.min()), lens.z_in)
+        refuse_open(float(solids[0].heights.min()), solids[0].lens.z_in)
     if scene.lens.entrance is not None or scene.elements:
         closed_mesh(scene, field, heights)  # raises an error if it is not a solid
-    out, found = Entities(scene.lens.mirror, decimals), []
+    out, found = Entities(scene.lens.cut_from, decimals), []
     for solid in solids:
         out.pose = solid.pose
-        found.append(lens_solid(out, solid.lens, solid.field, solid.heights, poles_of(solid.field, solid.heights.numpy())))
+        found.append(lens_solid(out, solid.lens, solid.field, solid.heights))
     out.pose = Pose()
-    rounded = scene.lens.round or any(e.round for e in scene.elements)
     digit = 0.0 if decimals is None else 10.0 ** (1 - decimals)
-    _product(out, found, max(ROUND_UNCERTAINTY if rounded else UNCERTAINTY, digit))
+    _product(out, found, max(digit, *(OUTLINES[body.aperture].uncertainty for body in (scene.lens, *scene.elements))))
     with atomic_file(path, "ascii") as file:
         file.write(HEAD)
         file.writelines(out.lines)
@@ -201,11 +198,10 @@ def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> 
 def readings(scene: Scene, field: HeightField, heights: Tensor, tolerance: float | None = None, poles: float = 1.0) -> Readings:
     """The surface as read from the poles, rounded as they are."""
     solids, decimals = _solids(scene, field, heights, tolerance, poles)
-    up = -1.0 if scene.lens.mirror else 1.0
     (exit, net), *fronts = solids[0].sides
     written = [h if decimals is None else torch.from_numpy(h.numpy().round(decimals)) for h in (net, *(h for _, h in fronts))]
     front = freeform_of(fronts[0][0], written[1]) if fronts else None
-    return {"error": lambda: of_poles(exit, up * written[0], front)}
+    return {"error": lambda: of_poles(exit, scene.lens.cut_from * written[0], front)}
 
 
 def _solids(
@@ -215,9 +211,8 @@ def _solids(
     all; arguments as in `write_step`."""
     if tolerance is not None:
         checks.number("⟨tolerance⟩", tolerance, 0.0)
-    heights, lens = heights.detach().double().cpu(), scene.lens
-    if lens.mirror:  # built upside down and reflected in z
-        heights, lens = -heights, replace(lens, z_in=-lens.z_in)
+    up = scene.lens.cut_from  # a mirror is built upside down and reflected in z
+    heights, lens = up * heights.detach().double().cpu(), replace(scene.lens, z_in=up * scene.lens.z_in)
     solids = [Solid(lens, field, heights, Pose()), *(Solid(b.lens, b.field, b.heights, b.pose) for b in bodies(scene))]
     if tolerance == 0:
         return solids, None
@@ -234,7 +229,8 @@ def _within(field: HeightField, heights: Tensor, tolerance: float, decimals: int
     """A surface on the fewest knots of PARTS with rounded poles within the tolerance, mm; on all of its own if none suffices."""
     for part in PARTS:
         fewer, net = on_fewer_knots(field, heights, math.ceil(part * math.prod(field.shape)))
-        if of_poles(fewer, torch.from_numpy(net.numpy().round(decimals))).largest_deviation(field, heights) <= tolerance:
+        read = of_poles(fewer, torch.from_numpy(net.numpy().round(decimals)))
+        if read.largest_deviation(field, heights, Aperture(field.half_size)) <= tolerance:
             break
     return fewer, net
 
@@ -243,12 +239,6 @@ def _bytes(field: HeightField, heights: Tensor, decimals: int) -> int:
     """Upper bound of the bytes of a pole and its reference."""
     widest = (field.half_size[0], field.half_size[1], float(heights.abs().max()))
     return len("#1234567=CARTESIAN_POINT('',(,,));\n#1234567,") + sum(len(f"{-w:.{decimals}f}") for w in widest)
-
-
-def poles_of(field: HeightField, net: np.ndarray) -> np.ndarray:
-    """Poles (n, m, 3) mm: control heights (n, m) at the Greville abscissae."""
-    x, y = (c.numpy() for c in field.control_xy())
-    return np.stack([*np.broadcast_arrays(x[:, None], y[None, :]), net], -1)
 
 
 def _spline_surface(out: Entities, field: HeightField, poles: np.ndarray) -> tuple[str, list[list[str]]]:
@@ -263,111 +253,145 @@ def _spline_surface(out: Entities, field: HeightField, poles: np.ndarray) -> tup
     return surface, points
 
 
-def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, poles: np.ndarray) -> str:
-    """The solid under the surface with poles (n, m, 3)."""
-    exit_surface, points = _spline_surface(out, field, poles)
-    if lens.round:
-        rim, lowest = _round_rim(out, field, heights)
-    else:
-        rim, lowest = _rim(out, poles, points, field.spaces), _lowest_on_rim(field, heights)
-    faces, upper, z_in = [out.face(exit_surface, out.bound(rim.edges), along=not lens.mirror)], rim, lens.z_in
+def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor) -> str:
+    """The solid under a surface, heights (n, m) mm."""
+    outline, z_in = OUTLINES[lens.aperture], lens.z_in
+    exit_surface, rim, lowest = _trimmed(out, outline, field, heights)
+    faces, upper = [out.face(exit_surface, out.bound(rim.edges), along=out.up > 0)], rim
     if lens.entrance is not None:
         front = entrance_of(lens)
-        low = front.heights + z_in
-        entrance, points = _spline_surface(out, front.field, poles := poles_of(front.field, low.numpy()))
-        foot = _round_rim(out, front.field, low)[0] if lens.round else _rim(out, poles, points, front.field.spaces)
-        faces += _walls(out, lens, rim, foot, 0.0)
+        entrance, foot, _ = _trimmed(out, outline, front.field, front.heights + z_in)
+        faces += outline.walls(out, lens.opening, rim, foot)
         faces.append(out.face(entrance, out.bound(_reversed(foot.edges)), along=False))
-        shell = out.add(f"CLOSED_SHELL('',({','.join(faces)}))")
-        return out.add(f"MANIFOLD_SOLID_BREP('lens',{shell})")
+        return _closed(out, faces)
+    wide = lens.opening.grown(lens.border)
     if lens.border > 0:
         high = z_in + FLANGE * (lowest - z_in)
-        inner, upper = _flat(out, lens, 0.0, high), _flat(out, lens, lens.border, high)
-        faces += _walls(out, lens, rim, inner, 0.0)
+        inner, upper = outline.flat(out, lens.opening, high), outline.flat(out, wide, high)
+        faces += outline.walls(out, lens.opening, rim, inner)
         flange = out.plane((0.0, 0.0, high), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
         faces.append(out.face(flange, out.bound(upper.edges), out.bound(_reversed(inner.edges), False)))
-    foot = _flat(out, lens, lens.border, z_in)
-    faces += _walls(out, lens, upper, foot, lens.border)
+    foot = outline.flat(out, wide, z_in)
+    faces += outline.walls(out, wide, upper, foot)
     entrance = out.plane((0.0, 0.0, z_in), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
     faces.append(out.face(entrance, out.bound(_reversed(foot.edges))))
+    return _closed(out, faces)
+
+
+def _trimmed(out: Entities, outline: Polygon, field: HeightField, heights: Tensor) -> tuple[str, Loop, float]:
+    """A B-spline surface, its border, and the least height there, mm."""
+    surface, points = _spline_surface(out, field, poles := control_points(field, heights.numpy()))
+    return surface, *outline.rim(out, field, heights, poles, points)
+
+
+def _closed(out: Entities, faces: list[str]) -> str:
+    """The solid between faces."""
     shell = out.add(f"CLOSED_SHELL('',({','.join(faces)}))")
     return out.add(f"MANIFOLD_SOLID_BREP('lens',{shell})")
 
 
-def _rim(out: Entities, poles: np.ndarray, points: list[list[str]], spaces: tuple[SplineSpace, SplineSpace]) -> Loop:
-    """Border of a rectangular surface: curves of its border poles."""
-    su, sv = spaces
-    corners = [poles[0, 0], poles[-1, 0], poles[-1, -1], poles[0, -1]]
-    vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
-    borders = ([row[0] for row in points], su), (points[-1], sv), ([row[-1] for row in points], su), (points[0], sv)
-    edges = []
-    for k, (border, space) in enumerate(borders):
-        start, end = (k, (k + 1) % 4) if k < 2 else ((k + 1) % 4, k)  # the curve's own direction: along +x or +y
-        curve = out.curve(space.degree, border, space.knots.numpy())
-        edges.append((out.edge(vertices[start], vertices[end], curve), k < 2))
-    return Loop(corners, vertices, edges)
+class Polygon:
+    """Edges and sides of a solid with a rectangular outline."""
 
-
-def _lowest_on_rim(field: HeightField, heights: Tensor) -> float:
-    """Least height on the border of a rectangular surface, mm, at the points of its default grid."""
-    (u, v), ends = (knot_lines(space, STEPS_PER_SPAN) for space in field.spaces), torch.tensor([0.0, 1.0], dtype=torch.float64)
-    return min(float(on_lines(field, heights, lines).z.min()) for lines in ((u, ends), (ends, v)))
-
-
-def _round_rim(out: Entities, field: HeightField, heights: Tensor) -> tuple[Loop, float]:
-    """Border of the surface over a circle: two interpolating cubic curves within ROUND_UNCERTAINTY / 10; and its least height,
-    mm."""
-    radius, count, off = field.half_size[0], 8 * max(field.shape), np.inf
-
-    def on(t: np.ndarray) -> np.ndarray:
-        x, y = radius * np.cos(t), radius * np.sin(t)
-        z = field.at(heights, *map(torch.from_numpy, (x, y)), [(0, 0)])[0].numpy()
-        return np.stack([x, y, z], -1)
-
-    while off > 0.1 * ROUND_UNCERTAINTY and count <= MOST_ON_RIM:
-        lines = [np.linspace(k * np.pi, (k + 1) * np.pi, count + 1) for k in (0, 1)]
-        curves = [make_interp_spline(t, on(t)) for t in lines]
-        middle = [(0.5 * (t[1:] + t[:-1])) for t in lines]
-        off = max(float(np.abs(c(t) - on(t)).max()) for c, t in zip(curves, middle, strict=True))
-        count *= 2
-    corners = [on(np.array([0.0]))[0], on(np.array([np.pi]))[0]]
-    vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
-    edges = [
-        (out.edge(vertices[k], vertices[1 - k], out.curve(3, [out.point(p) for p in c.c], c.t)), True) for k, c in enumerate(curves)
-    ]
-    return Loop(corners, vertices, edges), min(float(c.c[:, 2].min()) for c in curves)
-
-
-def _flat(out: Entities, lens: Lens, wider: float, z: float) -> Loop:
-    """Outline of the aperture, enlarged by `wider` mm, at z."""
-    rx, ry = (r + wider for r in lens.half_size)
-    flat = [(rx, 0.0), (-rx, 0.0)] if lens.round else [(-rx, -ry), (rx, -ry), (rx, ry), (-rx, ry)]
-    corners = [np.array([*p, z]) for p in flat]
-    vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
-    around = corners[1:] + corners[:1]
-    if lens.round:
-        circle = out.add(f"CIRCLE('',{out.placement((0, 0, z), (0, 0, out.up), (1, 0, 0))},{real(rx)})")  # orientation of the edges
-    curves = [circle if lens.round else out.line(a, b) for a, b in zip(corners, around, strict=True)]
-    edges = [(out.edge(a, b, c), True) for a, b, c in zip(vertices, vertices[1:] + vertices[:1], curves, strict=True)]
-    return Loop(corners, vertices, edges)
-
-
-def _walls(out: Entities, lens: Lens, upper: Loop, lower: Loop, wider: float) -> list[str]:
-    """Vertical faces between two loops: planes, or halves of a cylinder."""
-    posts = [
-        (out.edge(a, b, out.line(p, q)), True)
-        for a, b, p, q in zip(lower.vertices, upper.vertices, lower.corners, upper.corners, strict=True)
-    ]
+    uncertainty = UNCERTAINTY
+    #: Outward normals of the sides, from that at -y on, counter-clockwise.
     outward = (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)
-    if lens.round:
+
+    def rim(
+        self, out: Entities, field: HeightField, heights: Tensor, poles: np.ndarray, points: list[list[str]]
+    ) -> tuple[Loop, float]:
+        """Border of a surface within the outline, and its least height, mm: curves of the border poles, and the least of the points
+        of the default grid."""
+        su, sv = field.spaces
+        corners = [poles[0, 0], poles[-1, 0], poles[-1, -1], poles[0, -1]]
+        vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
+        borders = ([row[0] for row in points], su), (points[-1], sv), ([row[-1] for row in points], su), (points[0], sv)
+        edges = []
+        for k, (border, space) in enumerate(borders):
+            start, end = (k, (k + 1) % 4) if k < 2 else ((k + 1) % 4, k)  # the curve's own direction: along +x or +y
+            curve = out.curve(space.degree, border, space.knots.numpy())
+            edges.append((out.edge(vertices[start], vertices[end], curve), k < 2))
+        (u, v), ends = (knot_lines(space, STEPS_PER_SPAN) for space in field.spaces), torch.tensor([0.0, 1.0], dtype=torch.float64)
+        lowest = min(float(on_lines(field, heights, lines).z.min()) for lines in ((u, ends), (ends, v)))
+        return Loop(corners, vertices, edges), lowest
+
+    def flat(self, out: Entities, aperture: Aperture, z: float) -> Loop:
+        """The outline of an aperture at z."""
+        corners = [np.array([*p, z]) for p in self._corners(aperture)]
+        vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
+        curves = self._curves(out, aperture, corners)
+        edges = [(out.edge(a, b, c), True) for a, b, c in zip(vertices, vertices[1:] + vertices[:1], curves, strict=True)]
+        return Loop(corners, vertices, edges)
+
+    def _corners(self, aperture: Aperture) -> list[tuple[float, float]]:
+        rx, ry = aperture.half_size
+        return [(-rx, -ry), (rx, -ry), (rx, ry), (-rx, ry)]
+
+    def _curves(self, out: Entities, aperture: Aperture, corners: list[np.ndarray]) -> list[str]:
+        return [out.line(a, b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
+
+    def walls(self, out: Entities, aperture: Aperture, upper: Loop, lower: Loop) -> list[str]:
+        """Vertical faces between two loops over the outline of an aperture."""
+        posts = [
+            (out.edge(a, b, out.line(p, q)), True)
+            for a, b, p, q in zip(lower.vertices, upper.vertices, lower.corners, upper.corners, strict=True)
+        ]
+        faces = []
+        for k, (surface, post) in enumerate(zip(self._sides(out, aperture, lower), posts, strict=True)):
+            back = _reversed([upper.edges[k]]) + _reversed([post])  # along the foot, up, back along the top, down
+            faces.append(out.face(surface, out.bound([lower.edges[k], posts[(k + 1) % len(posts)], *back])))
+        return faces
+
+    def _sides(self, out: Entities, aperture: Aperture, lower: Loop) -> Iterator[str]:
+        """The surfaces of the sides."""
+        yield from (out.plane(at, normal, (0.0, 0.0, 1.0)) for at, normal in zip(lower.corners, self.outward, strict=True))
+
+
+class Circle(Polygon):
+    """Edges and sides of a solid with a circular outline: two halves of a cylinder."""
+
+    uncertainty = ROUND_UNCERTAINTY
+
+    def rim(
+        self, out: Entities, field: HeightField, heights: Tensor, poles: np.ndarray, points: list[list[str]]
+    ) -> tuple[Loop, float]:
+        """As of a polygon: two interpolating cubic curves within ROUND_UNCERTAINTY / 10."""
+        radius, count, off = field.half_size[0], 8 * max(field.shape), np.inf
+
+        def on(t: np.ndarray) -> np.ndarray:
+            x, y = radius * np.cos(t), radius * np.sin(t)
+            z = field.at(heights, *map(torch.from_numpy, (x, y)), [(0, 0)])[0].numpy()
+            return np.stack([x, y, z], -1)
+
+        while off > 0.1 * ROUND_UNCERTAINTY and count <= MOST_ON_RIM:
+            lines = [np.linspace(k * np.pi, (k + 1) * np.pi, count + 1) for k in (0, 1)]
+            curves = [make_interp_spline(t, on(t)) for t in lines]
+            middle = [(0.5 * (t[1:] + t[:-1])) for t in lines]
+            off = max(float(np.abs(c(t) - on(t)).max()) for c, t in zip(curves, middle, strict=True))
+            count *= 2
+        corners = [on(np.array([0.0]))[0], on(np.array([np.pi]))[0]]
+        vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
+        edges = [
+            (out.edge(vertices[k], vertices[1 - k], out.curve(3, [out.point(p) for p in c.c], c.t)), True)
+            for k, c in enumerate(curves)
+        ]
+        return Loop(corners, vertices, edges), min(float(c.c[:, 2].min()) for c in curves)
+
+    def _corners(self, aperture: Aperture) -> list[tuple[float, float]]:
+        return [(aperture.half_size[0], 0.0), (-aperture.half_size[0], 0.0)]
+
+    def _curves(self, out: Entities, aperture: Aperture, corners: list[np.ndarray]) -> list[str]:
+        place = out.placement((0, 0, corners[0][2]), (0, 0, out.up), (1, 0, 0))  # orientation of the edges
+        return [out.add(f"CIRCLE('',{place},{real(aperture.half_size[0])})")] * 2
+
+    def _sides(self, out: Entities, aperture: Aperture, lower: Loop) -> Iterator[str]:
         place = out.placement((0, 0, lower.corners[0][2]), (0, 0, 1), (1, 0, 0))
-        cylinder = out.add(f"CYLINDRICAL_SURFACE('',{place},{real(lens.half_size[0] + wider)})")
-    faces = []
-    for k, post in enumerate(posts):  # along the foot, up, back along the top, down
-        surface = cylinder if lens.round else out.plane(lower.corners[k], outward[k], (0.0, 0.0, 1.0))
-        back = _reversed([upper.edges[k]]) + _reversed([post])
-        faces.append(out.face(surface, out.bound([lower.edges[k], posts[(k + 1) % len(posts)], *back])))
-    return faces
+        cylinder = out.add(f"CYLINDRICAL_SURFACE('',{place},{real(aperture.half_size[0])})")
+        yield from (cylinder, cylinder)
+
+
+#: Outlines of solids by the name of the aperture.
+OUTLINES = {Aperture.name: Polygon(), CircularAperture.name: Circle()}
 
 
 def _reversed(edges: list[tuple[str, bool]]) -> list[tuple[str, bool]]:

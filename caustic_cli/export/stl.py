@@ -11,19 +11,16 @@ tracing the caustic on a dense grid; the LightTools archive has float64.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export import mesh
-from caustic_cli.export.reading import Readings
-from caustic_cli.export.surface import Sampling
 from caustic_cli.io.files import atomic_file
-from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene
 
 #: Must not begin with "solid", by which readers recognise the text variant.
 HEADER = f"binary STL of a lens, millimetres, caustic {__version__}".encode().ljust(80)
@@ -32,20 +29,13 @@ TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribu
 BLOCK = 1 << 20
 
 
-def write_stl(
-    path: str | Path,
-    scene: Scene,
-    field: HeightField,
-    heights: Tensor,
-    samples: Sampling | None = None,
-    tolerance: float | None = None,
-) -> None:
+def write_stl(path: str | Path, *lens: Any, **density: Any) -> None:
     """Write the solid atomically.  Arguments as in `closed_mesh`.
 
     Raises:
         InputError: as `closed_mesh`; points that coincide in float32; or the file cannot be written.
     """
-    vertices, faces = mesh.closed_mesh(scene, field, heights, samples, tolerance)
+    vertices, faces = mesh.closed_mesh(*lens, **density)
     vertices = vertices.astype("<f4")
     with atomic_file(path) as file:
         file.write(HEADER)
@@ -54,16 +44,9 @@ def write_stl(
             file.write(_records(vertices[faces[start : start + BLOCK]]).tobytes())
 
 
-def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
-    """Densities of files of at most `limit` bytes, the smallest first."""
-    return mesh.choices(scene, field, heights, limit, 2 * TRIANGLE.itemsize)
-
-
-def readings(
-    scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
-) -> Readings:
-    """The surface as read from the mesh, in float32."""
-    return mesh.readings(scene, field, heights, samples, tolerance, lambda p: p.astype(np.float32).astype(np.float64))
+#: Densities of files of at most `limit` bytes, the smallest first; and the surface as read from the mesh, in float32.
+choices = partial(mesh.choices, a_point=2 * TRIANGLE.itemsize)
+readings = partial(mesh.readings, rounded=lambda points: points.astype(np.float32).astype(np.float64))
 
 
 def _records(corners: np.ndarray) -> np.ndarray:

@@ -112,6 +112,12 @@ class SurfaceGrid:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
+def control_points(field: HeightField, net: np.ndarray) -> np.ndarray:
+    """Control points (n, m, 3) mm: heights (n, m) at the Greville abscissae."""
+    x, y = (c.numpy() for c in field.control_xy())
+    return np.stack([*np.broadcast_arrays(x[:, None], y[None, :]), net], -1)
+
+
 def counts_of(spaces: Sequence[SplineSpace], sampling: Sampling) -> tuple[int, int]:
     """Points (nx, ny) of a grid of this density."""
     if isinstance(sampling, int):

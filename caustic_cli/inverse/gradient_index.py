@@ -37,11 +37,12 @@ from caustic_cli.inverse.transport import corners, solve
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.gradient.fields import SplineIndex
+from caustic_cli.optics.gradient.medium import GradientMedium, index_name
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces import HeightField, Plane
-from caustic_cli.optics.system import ENTRANCE, EXIT, Element, Medium, System
-from caustic_cli.optics.trace import Tracer, index_name
-from caustic_cli.scene import Aperture, Scene
+from caustic_cli.optics.system import ENTRANCE, EXIT, Element, System
+from caustic_cli.optics.trace import Tracer
+from caustic_cli.scene import Scene
 
 #: Fixed-point iterations of the initial sines.
 SINES = 3
@@ -68,8 +69,8 @@ class GradientIndexDesign:
 
 def plate_system(scene: Scene, index: SplineIndex) -> System:
     """System of a flat entrance, a flat exit at the thickness of the lens, and the index field between them."""
-    lens, aperture = scene.lens, Aperture(scene.lens.half_size, scene.lens.round)
-    inside = Medium(lens.index, lens.absorption, lens.glass, index)
+    lens, aperture = scene.lens, scene.lens.opening
+    inside = GradientMedium(lens.index, lens.absorption, lens.glass, gradient=index)
     return System(
         (scene.source,),
         (

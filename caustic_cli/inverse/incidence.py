@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import singledispatch
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -29,7 +30,7 @@ from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Aperture, CircularAperture, Scene
 from caustic_cli.scene.sources.distribution import relative
 
 #: Newton iterations for q; the function is concave, so that they increase monotonically from the greater of two lower bounds.
@@ -54,7 +55,7 @@ def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
         InputError: the source lies behind the entrance.
     """
     light, directions = (_traced if scene.before else _direct)(scene, x, y, z)
-    return (light * _fraction_within(x, y, scene.lens.half_size[0]) if scene.lens.round else light), directions
+    return light * _part_within(scene.lens.opening, x, y), directions
 
 
 def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, tuple | None]:
@@ -106,9 +107,9 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     known, at, d, entered, part = (c.reshape(*c.shape[:-1], *shape) for c in (known, at, d, entered, part))
     ga, gb = (np.gradient(c, x, y) for c in at)
     power = part * np.abs(ga[0] * gb[1] - ga[1] * gb[0])
-    for where, half, round_ in ((at, pupil.half_size, pupil.round), (entered, lens.half_size, lens.round)):
-        far = np.hypot(*where) / half[0] if round_ else np.maximum(*(np.abs(c) / h for c, h in zip(where, half, strict=True)))
-        power = np.where(known & (far <= 1 + 1e-9), power, 0.0)
+    for where, aperture in ((at, pupil.aperture), (entered, lens.opening)):
+        inside = np.all([far / r <= 1 + 1e-9 for far, r in aperture.distances(*where)], axis=0)
+        power = np.where(known & inside, power, 0.0)
     power = power * _pupil_irradiance(scene, *at)
     return cell_means(power), _extrapolated(
         d, known & (power > 0), goal.reshape(2, *shape) / np.array(lens.half_size)[:, None, None]
@@ -143,7 +144,7 @@ def _pupil_irradiance(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Irradiance of the pupil at (a, b), interpolated between the centres of CELLS x CELLS cells."""
     pupil = scene.pupil
     size = (2.0 * pupil.half_size[0], 2.0 * pupil.half_size[1])
-    lens = replace(scene.lens, size=size, z_in=pupil.z, aperture="circle" if pupil.round else "rectangle", border=0.0)
+    lens = replace(scene.lens, size=size, z_in=pupil.z, aperture=pupil.aperture.name, border=0.0)
     edges = [np.linspace(-h, h, CELLS + 1) for h in pupil.half_size]
     light = on_entrance(replace(scene, lens=lens, elements=()), *edges)[0]
     middles = [0.5 * (e[1:] + e[:-1]) for e in edges]
@@ -151,10 +152,17 @@ def _pupil_irradiance(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return RegularGridInterpolator(middles, light)(points)
 
 
-def _fraction_within(x: np.ndarray, y: np.ndarray, radius: float) -> np.ndarray:
-    """Fraction of each cell with corners x, y within a circle, by PARTS x PARTS subsamples."""
+@singledispatch
+def _part_within(aperture: Aperture, x: np.ndarray, y: np.ndarray) -> np.ndarray | float:
+    """Fraction of each cell with corners x, y of a rectangle that is within the aperture."""
+    return 1.0
+
+
+@_part_within.register(CircularAperture)
+def _(aperture: CircularAperture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """By PARTS x PARTS subsamples."""
     fine = [np.linspace(c[0], c[-1], 2 * PARTS * (len(c) - 1) + 1)[1::2] for c in (x, y)]
-    inside = (fine[0][:, None] ** 2 + fine[1][None, :] ** 2 <= radius**2).astype(float)
+    inside = aperture.contains(fine[0][:, None], fine[1][None, :]).astype(float)
     return inside.reshape(len(x) - 1, PARTS, len(y) - 1, PARTS).mean((1, 3))
 
 
@@ -190,7 +198,7 @@ def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     if lens.fresnel != "none":
         power *= 1.0 - reflectance("exact", cosine, inside, 1.0 / n)
     power *= relative(source.intensity, q)
-    cone = min(source.cone_over(lens.half_size, lens.z_in, lens.round), 1.57079)
+    cone = min(source.cone_over(lens.pupil), 1.57079)
     through = [np.abs(c0 + h * s) <= r * (1 + 1e-9) for c0, s, r in zip((x0, y0), (sx, sy), lens.half_size, strict=True)]
     power = np.where((q <= math.tan(cone) * (1 + 1e-9)) & through[0] & through[1], power, 0.0)
     light = irradiance(scene, x, y, float(z.mean()))

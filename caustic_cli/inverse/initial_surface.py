@@ -315,7 +315,7 @@ def sphere_net(element: Component, side: str, field: HeightField) -> Tensor:
 def departure_bound(element: Component, lens: Lens) -> float:
     """Largest departure of a designed surface of another element from its sphere, mm: that of the exit, limited by the
     thickness."""
-    thinnest = element.thickness + min(0.0, element.sag("back") - element.sag("front")) if not element.mirror else np.inf
+    thinnest = element.thinnest
     return min(lens.height_range[1], THICKNESS_PART * thinnest)
 
 

@@ -36,7 +36,8 @@ def internal_rays(scene: Scene, field: HeightField, nets: Tensor, count: int) ->
     found = []
     for traced in tracers(lit, field, rays_of(lit, "grid", count), torch.float64, CHUNK):
         last = traced.last({EXIT: net})
-        full = [*last.state.full(last.local), *last.state.full(last.incoming), last.power_in, torch.as_tensor(last.length)]
+        hit = last.hit
+        full = [*last.state.full(hit.local), *last.state.full(hit.incoming), last.power_in, torch.as_tensor(hit.length)]
         found.append(torch.stack(torch.broadcast_tensors(*full))[:, last.power_in > 0])
     rays = torch.cat(found, 1).numpy()
     exit, direction = rays[:3], rays[3:6]

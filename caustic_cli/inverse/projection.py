@@ -74,10 +74,9 @@ class ScreenProjection:
 
     def land(self, origin, direction) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Intersection of rays, components (N,) float64 or numbers, with the screen: x, y (N,) mm, and whether they reach it."""
-        s, shape = self.screen, shape_of(self.screen)
-        land = Torch().land if shape is None else shape.land
+        s = self.screen
         forward = self.forward if s.axes[2][2] >= 0 else -self.forward
-        return land(origin, direction, (*s.shift, s.z), s.axes, forward)
+        return shape_of(s).land(Torch(), origin, direction, (*s.shift, s.z), s.axes, forward)
 
     def projected_target(self, target: np.ndarray) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
         """Power on a regular grid of cells of the plane, FINER per pixel, from that on the screen's pixels (n_x, n_y), not all

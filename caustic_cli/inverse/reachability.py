@@ -31,8 +31,8 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
     Raises:
         InputError: no light falls on the lens, or none of it can be deflected far enough.
     """
-    lens = scene.lens
-    if lens.mirror or scene.source.rays is not None or scene.source.apart:
+    lens, limit = scene.lens, scene.lens.interaction.largest_deflection(scene.lens.index)
+    if limit >= math.pi or scene.source.rays is not None or scene.source.apart:
         return
     goal, most, lit = _lit(scene, target), -1.0, False
     for x, y, d in _in_glass(scene, max(1, PAIRS // goal.shape[1])):
@@ -45,7 +45,7 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
             "[source] none of its light falls on the lens: its position, direction or cone miss the aperture of"
             f" {lens.size[0]:g} x {lens.size[1]:g} mm at z = {lens.z_in:g} mm"
         )
-    turn, limit = (math.degrees(math.acos(min(1.0, c))) for c in (most, 1.0 / lens.inside))
+    turn, limit = math.degrees(math.acos(min(1.0, most))), math.degrees(limit)
     raise InputError(
         "[screen] no light can be refracted to the picture: it would have to be deflected by at least"
         f" {turn:.3g} degrees, and glass of index {lens.inside:g} deflects it by less than {limit:.3g}; a picture"
@@ -71,11 +71,11 @@ def largest_magnification(scene: Scene, picture: Sequence[float]) -> float | Non
 
     For collimated light: a map without folds sends the corner of the lens, whose rays are deflected most, to that of the picture.
     """
-    lens = scene.lens
-    if lens.mirror or not scene.source.collimated:
+    lens, limit = scene.lens, scene.lens.interaction.largest_deflection(scene.lens.index)
+    if limit >= math.pi or not scene.source.collimated:
         return None
     throw = scene.screen.z - lens.offset.thickness
-    reach = throw * math.tan(math.acos(1.0 / lens.inside))
+    reach = throw * math.tan(limit)
     corner, goal = np.array(lens.half_size), 0.5 * np.array(picture)
     along, square = goal @ corner, goal @ goal  # |f goal - corner| = reach
     root = along**2 - square * (corner @ corner - reach**2)
@@ -89,16 +89,15 @@ def _in_glass(scene: Scene, rays: int) -> Iterator[tuple[np.ndarray, np.ndarray,
     """
     source, lens = scene.source, scene.lens
     x, y = (c.ravel() for c in np.meshgrid(*(np.linspace(-h, h, ENTRANCE) for h in lens.half_size), indexing="ij"))
-    if lens.round:
-        inside = np.hypot(x, y) <= lens.half_size[0] * (1.0 + 1e-9)
-        x, y = x[inside], y[inside]
+    inside = np.all([far <= r * (1.0 + 1e-9) for far, r in lens.opening.distances(x, y)], axis=0)
+    x, y = x[inside], y[inside]
     if source.distant:
         sine = math.sin(source.half_angle)
         a, b = (sine * c[:, None] for c in AROUND)
         along = np.sqrt(1.0 - a * a - b * b)
         yield _refracted(scene, x, y, a / along + 0.0 * x, b / along + 0.0 * y)
         return
-    cone = min(source.cone_over(lens.half_size, lens.z_in, lens.round), 0.5 * math.pi)
+    cone = min(source.cone_over(lens.pupil), 0.5 * math.pi)
     around = AROUND if max(source.extent) > 0 else AROUND[:, :1]
     (a, b), points = (w * c for w, c in zip(source.extent, around, strict=True)), source.points()[0]
     each = max(1, rays // (len(x) * around.shape[1]))

@@ -25,7 +25,7 @@ from caustic_cli.optics.screen_shape import normals, points_in_space
 from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.scene import Scene, Source
+from caustic_cli.scene import Aperture, CircularAperture, Scene, Source
 from caustic_cli.scene.sources.distribution import relative
 
 #: The blur is taken as a convolution where the deviation from it is at most this fraction of its half width.
@@ -115,7 +115,7 @@ def point_source(scene: Scene) -> Source:
     """A point source at the centre of the extended one, with the same cone."""
     source = scene.source.pointlike()
     if not source.distant and source.cone is None:
-        cone = scene.source.cone_over(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
+        cone = scene.source.cone_over(scene.lens.pupil)
         return replace(source, cone=math.degrees(cone))
     return source
 
@@ -139,34 +139,31 @@ def etendue_limit(scene: Scene) -> float | None:
     lens, screen, source = scene.lens, scene.screen, scene.source
     if not source.even:
         return None
-    x, y, cell = _area(lens.half_size, lens.round)
+    x, y, cell = _area(lens.half_size, lens.opening)
     area = cell * len(x)
     if source.distant:
         given = area * math.pi * math.sin(source.half_angle) ** 2
     elif min(source.extent) > 0 and len(source.points()[0]) == 1:
-        a, b, part = _area(source.extent, True)
+        a, b, part = _area(source.extent, CircularAperture())
         x0, y0, z0 = source.points()[0][0]
         seen = _geometric_factor(x, y, (a + x0, b + y0, z0 - lens.z_in))
         slope = np.hypot(a + x0 - x[:, None], b + y0 - y[:, None]) / (lens.z_in - z0)
-        cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
+        cone = source.cone_over(lens.pupil)
         given = cell * part * seen[(np.arctan(slope) <= cone) & (relative(source.intensity, slope) > 0)].sum()
     else:
         return None
-    a, b, part = _area(screen.half_size, False)
+    a, b, part = _area(screen.half_size, Aperture())
     px, py, pz = points_in_space(screen, a, b)
     taken = cell * part * _geometric_factor(x, y, (px, py, pz - lens.offset.thickness), normals(screen, a, b)).sum()
     return min(1.0, float(taken / given)) if given > 0 else None
 
 
-def _area(half: tuple[float, float], round: bool) -> tuple[np.ndarray, np.ndarray, float]:
-    """Midpoint-rule nodes of a rectangle or an ellipse, mm, and the area of each, mm^2."""
+def _area(half: tuple[float, float], shape: Aperture) -> tuple[np.ndarray, np.ndarray, float]:
+    """Midpoint-rule nodes of an aperture's shape stretched to half widths, mm, and the area of each, mm^2."""
     x, y = (h * ((np.arange(POINTS) + 0.5) * (2.0 / POINTS) - 1.0) for h in half)
     x, y = (c.ravel() for c in np.meshgrid(x, y, indexing="ij"))
-    area = 4.0 * half[0] * half[1]
-    if round:
-        inside = (x / half[0]) ** 2 + (y / half[1]) ** 2 <= 1.0
-        x, y, area = x[inside], y[inside], area * math.pi / 4.0
-    return x, y, area / len(x)
+    inside = shape.covers(x / half[0], y / half[1])
+    return x[inside], y[inside], half[0] * half[1] * shape.filled / np.count_nonzero(inside)
 
 
 def _geometric_factor(x: np.ndarray, y: np.ndarray, point: tuple, normal: tuple = (0.0, 0.0, 1.0)) -> np.ndarray:

@@ -116,12 +116,7 @@ def surface(
     """
     began = time.perf_counter()
     shape = np.shape(source)
-    mirror = index == -1.0
-    if not (mirror or 1.0 < index <= 5.0 or 0.2 <= index < 1.0):
-        raise InputError(f"index must be more than 1 and at most 5, or its inverse, got {index!r}")
-    if not (np.isfinite(z_screen) and np.isfinite(thickness) and (z_screen < thickness if mirror else z_screen > thickness)):
-        where = "before the mirror's" if mirror else "beyond the lens'"
-        raise InputError(f"the screen at {z_screen!r} mm must lie {where} height of {thickness!r} mm")
+    _check_place(index, z_screen, thickness)
     d = _directions(directions, (shape[0] + 1, shape[1] + 1))
     half = tuple(float(h) for h in source_half)
     map_ = solve(source, target, half, target_half, **options)
@@ -144,6 +139,14 @@ def surface(
         map_ = solve(source, moved, half, reach, start=map_.potential, **{k: v for k, v in options.items() if k != "start"})
         aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
     return MappedSurface(z, *landing, miss, shift, again, map_, time.perf_counter() - began)
+
+
+def _check_place(index: float, z_screen: float, thickness: float) -> None:
+    if not (index == -1.0 or 1.0 < index <= 5.0 or 0.2 <= index < 1.0):
+        raise InputError(f"index must be more than 1 and at most 5, or its inverse, got {index!r}")
+    if not (np.isfinite(z_screen) and np.isfinite(thickness) and math.copysign(1.0, index) * (z_screen - thickness) > 0):
+        where = "beyond the lens'" if index > 0 else "before the mirror's"
+        raise InputError(f"the screen at {z_screen!r} mm must lie {where} height of {thickness!r} mm")
 
 
 def finer(
@@ -319,17 +322,17 @@ def refract_to_screen(
     def flat(value):
         return value if isinstance(value, float) else torch.from_numpy(np.broadcast_to(value, shape).flatten())
 
-    origin, slopes, mirror = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy)), index == -1.0
+    origin, slopes = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy))
     out = backend.interact(
         tuple(map(flat, d)),
         slopes,
         torch.ones(z.size, dtype=torch.float64),
-        eta=1.0 if mirror else index,
-        reflects=mirror,
+        eta=abs(index),
+        reflects=index < 0,
         fresnel=fresnel,
     )
     if projection is None:
-        landing = backend.land(tuple(origin), out.direction, (0.0, 0.0, z_screen), IDENTITY, -1.0 if mirror else 1.0)[:2]
+        landing = backend.land(tuple(origin), out.direction, (0.0, 0.0, z_screen), IDENTITY, math.copysign(1.0, index))[:2]
         passes = out.passes
     else:
         landing = map(torch.from_numpy, projection.intersections(*(tuple(map(_array, v)) for v in (origin, out.direction))))

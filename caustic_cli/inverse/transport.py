@@ -161,28 +161,20 @@ def solve(
     if not 0.5 <= smooth <= 16:
         raise InputError(f"smooth must be 0.5 to 16 source cells, got {smooth!r}")
     n, m = f.shape
-    f = np.maximum(f / f.mean(), darkest)
-    f = f[:1, :1] if np.ptp(f) == 0 else f
-    f = f / (f.mean() * 4.0 * a * b)
-    most_sites = int(
-        n * m * f.mean() ** 2 / (f * f).mean()
-    )  # so that Laguerre cells are not smaller than source cells where most light is
+    f = _normalised(f, darkest, (a, b))
+    most_sites = int(n * m * f.mean() ** 2 / (f * f).mean())  # no Laguerre cells below source cells where most light is
     pyramid = _pyramid(g, (c, d), most_sites)
     psi = sites = None
     steps = 0
-    for fewer in LEVELS:
-        if start is not None and fewer > 1:
-            continue
+    for fewer in LEVELS if start is None else LEVELS[-1:]:
         goal = max(most_sites // fewer, 16)
         raster = [centres(_points(s * fewer**-0.5), h) for s, h in ((n, a), (m, b))]
         old, sites = sites, _sites(pyramid, 1.0 / goal)
+        linear = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)  # prices of the map that stretches the rectangle
         if start is not None:
             psi = _prices(_resampled(start, (n, m), (a, b), raster), sites, raster)
-        elif old is None:
-            psi = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)
         else:
-            coarse = [centres(int(ROUGH * len(x)), h) for x, h in zip(raster, (a, b), strict=True)]
-            psi = _prices(_rounded(psi, old, coarse, (a, b)), sites, coarse)
+            psi = linear if old is None else _refined(psi, old, sites, raster, (a, b))
         enough = max(tolerance, MERGED) if fewer == 1 else COARSE_TOLERANCE
         found, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b), enough, most)
         steps += taken
@@ -192,13 +184,9 @@ def solve(
             again = solve(source, target, source_half, target_half, **options)
             return replace(again, steps=steps + again.steps, seconds=time.perf_counter() - began)
         if failed:  # continuation from uniform light
-            psi = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)
-            for even in EVENER:
-                light = _light(f, even, raster, a, b)
-                psi, left, taken = _newton(psi, sites, raster, light, COARSE_TOLERANCE if even else enough, most)
-                steps += taken
-            if left < error:
-                found, error = psi, left
+            *other, taken = _continued(linear, sites, raster, f, (a, b), enough, most)
+            steps += taken
+            found, error = min((found, error), other, key=lambda pair: pair[1])
         psi = found
     for _ in range(ROUNDS):
         if error < tolerance or taken == 0:
@@ -209,6 +197,28 @@ def solve(
     potential, x, y = _smoothed(psi, sites, (n, m), (a, b), smooth)
     solved = _Solved(psi, sites, (n, m), (a, b))
     return Transport(potential - potential.mean(), x, y, error, len(psi), steps, time.perf_counter() - began, solved)
+
+
+def _normalised(f: np.ndarray, darkest: float, half: tuple[float, float]) -> np.ndarray:
+    """The source with the integral 1 and a lower bound over its mean; a uniform one as a single cell."""
+    f = np.maximum(f / f.mean(), darkest)
+    f = f[:1, :1] if np.ptp(f) == 0 else f
+    return f / (f.mean() * 4.0 * half[0] * half[1])
+
+
+def _continued(psi: np.ndarray, sites: _Sites, raster, f: np.ndarray, half: tuple[float, float], enough: float, most: int):
+    """Prices by Newton's method in steps from uniform light to that of the source, their error, and the number of its steps."""
+    steps = 0
+    for even in EVENER:
+        psi, error, taken = _newton(psi, sites, raster, _light(f, even, raster, *half), COARSE_TOLERANCE if even else enough, most)
+        steps += taken
+    return psi, error, steps
+
+
+def _refined(psi: np.ndarray, coarser: _Sites, sites: _Sites, raster: list[np.ndarray], half: tuple[float, float]) -> np.ndarray:
+    """Prices of the sites of a level, from those of the coarser one."""
+    coarse = [centres(int(ROUGH * len(x)), h) for x, h in zip(raster, half, strict=True)]
+    return _prices(_rounded(psi, coarser, coarse, half), sites, coarse)
 
 
 def _points(cells: float) -> int:

@@ -27,7 +27,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves.image import Imager, Line, lines_of
 from caustic_cli.optics.waves.propagation import TURN, power_on_pixels
-from caustic_cli.optics.waves.receiver import receiver_of
+from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.optics.waves.wavefront import Wavefront
 from caustic_cli.scene import Scene
 
@@ -111,7 +111,7 @@ class WaveObjective:
                     made[key] = imager.front(line, mode, parameters, sensitive=True)
                 front = made[key]
                 phase, amplitude = imager.field(line, front, self.dtype)
-                slope = (TURN / line.length * front.sensitivity).to(self.dtype)
+                slope = (TURN / line.length * front.last.sensitivity).to(self.dtype)
                 rows, columns = imager.masks(line, phase.device, self.dtype)
                 yield Contribution(line, k, front, phase, slope, amplitude, rows, columns, front.power())
 
@@ -161,12 +161,12 @@ class WaveObjective:
 
     def _moved(self, front: Wavefront, change: Tensor) -> Tensor:
         """Displacement of the surface at the intersections of the rays of a wavefront, (n, m) mm."""
-        return self.field.evaluate(change, front.at_x.reshape(-1), front.at_y.reshape(-1))[0].view(front.at_x.shape)
+        return front.last.displacement(lambda x, y: self.field.evaluate(change, x, y)[0])
 
     def _image(self, part: Contribution, moved: Tensor) -> Tensor:
         imager = self.imager
-        if not imager.upright:
-            front = replace(part.front, path=part.front.path + part.front.sensitivity * moved)
+        if not imager.receiver.across:
+            front = replace(part.front, path=part.front.path + part.front.last.sensitivity * moved)
             return imager.image(part.line, front, part.mode, self.dtype)[0]
         found = power_on_pixels(part.phase + part.slope * moved, part.amplitude, imager.sampling.padded, part.rows, part.columns)
         return imager.spread_out(found, part.mode)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import Archive, open_npz
 from caustic_cli.io.surfaces import ACCEPTED, MAX_CONTROL, surface_of
@@ -18,7 +19,7 @@ from caustic_cli.optics.bspline import MAX_DEGREE
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import freeform_of
 from caustic_cli.scene import Component, Disc, FreeForm, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, Source
-from caustic_cli.scene.elements import SIDES
+from caustic_cli.scene.elements import COMPONENTS, SIDES
 from caustic_cli.scene.light import MAX_WAVELENGTHS
 from caustic_cli.scene.materials import material
 from caustic_cli.scene.screen import MAX_SAGS, Sags
@@ -94,8 +95,7 @@ def _elements(data: Archive) -> tuple[Component, ...]:
     )
     size, tilt, bent = (data.reals(f"element_{key}", count, 2).tolist() for key in ("size", "tilt", "curvature"))
     return tuple(
-        Component(
-            kinds[k],
+        COMPONENTS[check("element.type", kinds[k])](
             z[k],
             tuple(size[k]),
             thickness[k],

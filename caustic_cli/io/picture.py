@@ -6,6 +6,7 @@ j along +y.  Pixel values are sRGB-encoded or linear; irradiance is always linea
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from collections.abc import Iterator, Mapping
@@ -19,7 +20,7 @@ from scipy.ndimage import binary_closing
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import open_npy
-from caustic_cli.io.files import NPY_HEADER, NPY_MAGIC, SOFTWARE, Piped, atomic_file, naming, open_regular
+from caustic_cli.io.files import NPY_HEADER, NPY_MAGIC, SOFTWARE, Piped, naming, open_regular, write_bytes
 
 #: Largest picture read, in pixels: a float64 copy of it is half a gigabyte.
 MAX_PIXELS = 8192 * 8192
@@ -107,12 +108,9 @@ class Picture:
             found += float(np.maximum((joined[:, 1:] & ~joined[:, :-1]).sum(1) - 1, 0).mean())
         return found
 
-    def write(self, path: Path) -> None:
-        """Write the picture losslessly; `path` ends in `suffix`."""
-        if self.suffix == ".npy":
-            write_npy(path, self.values)
-        else:
-            _write_png(path, Image.fromarray(self.values))
+    def encoded(self) -> bytes:
+        """The picture as a lossless file whose name ends in `suffix`."""
+        return _npy(self.values) if self.suffix == ".npy" else _png(Image.fromarray(self.values))
 
 
 def read_picture(path: str | Path | Piped, linear: bool = False, color: bool = False, invert: bool = False) -> Picture:
@@ -281,7 +279,7 @@ def write_image(
     """
     codes = codes_of(irradiance, white, encoding)
     times = -(-wide // codes.shape[1])
-    _write_png(Path(path), Image.fromarray(codes.repeat(times, 0).repeat(times, 1)), said)
+    write_bytes(path, _png(Image.fromarray(codes.repeat(times, 0).repeat(times, 1)), said))
 
 
 def said_of(path: str | Path) -> dict[str, str]:
@@ -302,18 +300,21 @@ def codes_of(irradiance: np.ndarray, white: float, encoding: str) -> np.ndarray:
 
 def write_npy(path: str | Path, array: np.ndarray) -> None:
     """Write a .npy (format 1.0) whose header is padded to NPY_HEADER bytes, by which the program recognises its own files."""
+    write_bytes(path, _npy(array))
+
+
+def _npy(array: np.ndarray) -> bytes:
     array = np.ascontiguousarray(array)
     text = repr({"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape})
     header = text.ljust(NPY_HEADER - 11) + "\n"
-    with atomic_file(path) as file:
-        file.write(NPY_MAGIC + b"\x01\x00" + len(header).to_bytes(2, "little") + header.encode("latin1"))
-        file.write(array.tobytes())
+    return NPY_MAGIC + b"\x01\x00" + len(header).to_bytes(2, "little") + header.encode("latin1") + array.tobytes()
 
 
-def _write_png(path: Path, image: Image.Image, said: Mapping[str, str] | None = None) -> None:
+def _png(image: Image.Image, said: Mapping[str, str] | None = None) -> bytes:
     info = PngImagePlugin.PngInfo()
     info.add_text("Software", SOFTWARE)
     for key, text in (said or {}).items():
         info.add_text(key, text)
-    with atomic_file(path) as file:
-        image.save(file, format="PNG", pnginfo=info)
+    held = io.BytesIO()
+    image.save(held, format="PNG", pnginfo=info)
+    return held.getvalue()

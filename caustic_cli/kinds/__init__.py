@@ -45,11 +45,12 @@ def problem_of(described: Described, device: str = "cpu") -> OneSurface:
     return kind_of(described.settings).of(described, device)
 
 
-def complete_design(s: Settings, wanted: Defaults) -> None:
-    """Complete [design], its stages and the control net of a lens, all other sections being complete.
+def complete_design(wanted: Defaults) -> Settings:
+    """Settings with [design], its stages and the control net of a lens completed, all other sections being complete.
 
     Raises:
         InputError: a value is out of range, or two contradict each other.
     """
     wanted.refuse_given_stages()
-    kind_of(s).complete(wanted)
+    kind_of(wanted.s).complete(wanted)
+    return wanted.s

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 from caustic_cli.config.default_stages import LEAST_SPANS, RAYS_PER_PIXEL, Table, completed_stage, usual_sampler
 from caustic_cli.config.design import relative_to_initial
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen
-from caustic_cli.config.table import check
+from caustic_cli.config.table import DesignSettings, LensSettings, StageSettings, check
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.scene import Scene, Source
@@ -21,16 +23,40 @@ class Defaults:
     """Settings, complete but for the design, and the user's wishes.
 
     Args:
-        s: all settings, which are completed in place; source: built from them.
+        s: all settings, replaced as they are completed; source: built from them.
         quality: of the default stages, None for that of the time limit; rays: of the last of them, None for that of the quality.
         lit, gaps: of the picture, see `config.completion.complete`.
     """
 
     def __init__(self, s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float], gaps: float):
         self.s, self.source, self.asked, self.rays, self.lit, self.gaps = s, source, quality, rays, lit, gaps
-        self.lens: Table = s["lens"]
-        self.design: Table = s["design"]
-        self.own_control = "control" in self.lens
+        self.own_control = "control" in s.lens
+
+    @property
+    def lens(self) -> LensSettings:
+        """The [lens] section as completed so far."""
+        return self.s.lens
+
+    @property
+    def design(self) -> DesignSettings:
+        """The [design] section as completed so far."""
+        return self.s.design
+
+    def set_control(self, control: Sequence[int]) -> None:
+        """Set the control net."""
+        self.s = self.s.changed(lens=self.lens.changed(control=control))
+
+    def set_design(self, **values: Any) -> None:
+        """Set values of [design]."""
+        self.s = self.s.changed(design=self.design.changed(**values))
+
+    def fill_design(self, **values: Any) -> None:
+        """Set values of [design] that are not given."""
+        self.s = self.s.changed(design=self.design.filled(**values))
+
+    def set_stages(self, stages: Sequence[Table]) -> None:
+        """Set the stages."""
+        self.set_design(stages=[StageSettings(stage) for stage in stages])
 
     def refuse_given_stages(self) -> None:
         """Refuse wishes for the default stages beside stages of the user's own.
@@ -38,7 +64,7 @@ class Defaults:
         Raises:
             InputError: both are given.
         """
-        check("lens.degree", self.lens["degree"])
+        check("lens.degree", self.lens.degree)
         if "stages" in self.design and (self.asked or self.rays):
             raise InputError(
                 "⟨quality⟩ and ⟨rays⟩ shape the default stages, but the configuration brings [[design.stages]]"
@@ -48,14 +74,13 @@ class Defaults:
     @cached_property
     def quality(self) -> str:
         """The quality asked for, or that which the time limit permits at 250 x 250 pixels on two cores."""
-        seconds = self.design["time_limit"] / (EXTENDED if self.source.extended else 1.0)
+        seconds = self.design.time_limit / (EXTENDED if self.source.extended else 1.0)
         return self.asked or ("draft" if seconds < DRAFT_SECONDS else "fine" if FINE_SECONDS <= seconds < math.inf else "standard")
 
     @property
     def resolution(self) -> tuple[int, int]:
         """Pixels of the screen."""
-        nx, ny = self.s["screen"]["resolution"]
-        return nx, ny
+        return self.s.screen.resolution
 
     @property
     def sampled(self) -> int:
@@ -70,12 +95,12 @@ class Defaults:
     @property
     def trained(self) -> bool:
         """Whether the heights are the output of a network."""
-        return self.design["network"] != "none"
+        return self.design.network != "none"
 
     @property
     def plain(self) -> bool:
         """Whether the heights themselves are optimised, by L-BFGS."""
-        return not self.trained and self.design["optimizer"] == "lbfgs"
+        return not self.trained and self.design.optimizer == "lbfgs"
 
     @property
     def from_surface(self) -> bool:
@@ -85,20 +110,18 @@ class Defaults:
     @property
     def fine_net(self) -> bool:
         """Whether the control net resolves an initial surface by transport."""
-        return not self.own_control or (
-            min(n - p for n, p in zip(self.lens["control"], self.lens["degree"], strict=True)) >= LEAST_SPANS
-        )
+        return not self.own_control or (min(n - p for n, p in zip(self.lens.control, self.lens.degree, strict=True)) >= LEAST_SPANS)
 
     @cached_property
     def shifts(self) -> bool:
         """Whether the source's extent only shifts the image."""
         s = self.s
-        lens = build_lens({**s, "lens": {"control": [LEAST_SPANS] * 2, **s["lens"]}})
-        return source_spread(Scene(self.source, lens, build_screen(s), build_light(s))) is not None
+        lens = build_lens(s.lens.filled(control=[LEAST_SPANS] * 2))
+        return source_spread(Scene(self.source, lens, build_screen(s.screen), build_light(s))) is not None
 
     def complete_given_stages(self) -> bool:
         """Complete stages of the user's own; False if there are none."""
         if "stages" not in self.design:
             return False
-        self.design["stages"] = [completed_stage(stage, self.s, self.sampler) for stage in self.design["stages"]]
+        self.set_stages([completed_stage(stage, self.s, self.sampler) for stage in self.design.stages])
         return True

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config.default_stages import Table, two_sided
-from caustic_cli.config.settings import Settings, elements_of
+from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import departure_bound, sphere_net
 from caustic_cli.kinds.defaults import Defaults
@@ -22,7 +22,7 @@ class AmongElements(OneSurface):
 
     @classmethod
     def applies(cls, s: Settings) -> bool:
-        return bool(elements_of(s))
+        return bool(s.elements)
 
     @classmethod
     def spread(cls, d: Defaults) -> bool:
@@ -31,7 +31,7 @@ class AmongElements(OneSurface):
     @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
         if cls.exact_start(d):
-            return two_sided(tuple(d.lens["control"]), d.rays, d.resolution, d.quality)
+            return two_sided(d.lens.control, d.rays, d.resolution, d.quality)
         return super().default_stages(d, waves)
 
     def _bounds(self, k: int) -> tuple[Tensor, Tensor]:
@@ -56,12 +56,12 @@ class FreeElements(SeveralSurfaces, AmongElements):
 
     @classmethod
     def applies(cls, s: Settings) -> bool:
-        return any(table.get("free", "none") != "none" for table in elements_of(s))
+        return any(element.free != "none" for element in s.elements)
 
     @classmethod
     def refuse_settings(cls, d: Defaults) -> None:
         super().refuse_settings(d)
-        if d.design["start"] != "transport":
+        if d.design.start != "transport":
             raise InputError(
                 f"⟨design.start⟩ of several free surfaces must be transport, got {d.design['start']}; a small net or several points"
                 " have no such start"

@@ -17,7 +17,7 @@ from caustic_cli.inverse.loss_terms import parse
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
-from caustic_cli.optics.waves import WaveImage
+from caustic_cli.optics.waves.image import WaveImage
 from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import RELATIVE_NOISE, evaluation_rays, retrace
 from caustic_cli.studies.waves import unseen_figures, wave_figures

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from caustic_cli.config.default_stages import refinement, transport_cells
-from caustic_cli.config.settings import Settings, value_of
-from caustic_cli.config.table import check, default
+from caustic_cli.config.settings import Settings
+from caustic_cli.config.table import LensSettings, check, default
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.gradient_index import design_gradient_index
@@ -35,38 +35,38 @@ class IndexPlate(OneSurface):
 
     @classmethod
     def applies(cls, s: Settings) -> bool:
-        return s["lens"].get("gradient") == "free"
+        return s.lens.gradient == "free"
 
     @classmethod
     def complete(cls, d: Defaults) -> None:
         """L-BFGS from optimal transport, on rays."""
         s, lens, design = d.s, d.lens, d.design
         if not d.source.collimated:
-            raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
-        if max(value_of(lens, "lens.array")) > 1:
+            raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s.source.type}")
+        if max(lens.array) > 1:
             raise InputError("⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat")
-        if value_of(s["target"], "target.color"):
+        if s.target.color:
             raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
-        if robust := design.get("robust"):
+        if robust := design.robust:
             raise InputError(
                 f"⟨design.robust⟩ {robust} averages over errors of a designed surface, but ⟨lens.gradient⟩ free designs the index"
             )
-        if design.setdefault("start", "offset") not in ("offset", "transport"):
-            raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design['start']}")
+        if design.get("start", "offset") not in ("offset", "transport"):
+            raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design.start}")
         for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
             if design[key] != only:
                 raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
-        if check("design.waves", design["waves"]) == "on":
+        if check("design.waves", design.waves) == "on":
             raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
-        design["start"] = "offset"  # of the surface, which is flat; the index starts from optimal transport
-        design.setdefault("preconditioner", "laplacian")
+        d.set_design(start="offset")  # of the surface, which is flat; the index starts from optimal transport
+        d.fill_design(preconditioner="laplacian")
         if "stages" not in design:
-            last = refinement(tuple(lens["control"]), d.rays, d.resolution, d.quality)[-1]
-            design["stages"] = [last | {"rays": d.rays or min(last["rays"], RAYS_BENT * math.prod(d.resolution))}]
+            last = refinement(lens.control, d.rays, d.resolution, d.quality)[-1]
+            d.set_stages([last | {"rays": d.rays or min(last["rays"], RAYS_BENT * math.prod(d.resolution))}])
 
     def iterate(
         self,
-        lens: dict[str, Any],
+        lens: LensSettings,
         iterations: int,
         began: float,
         time_limit: float,
@@ -100,9 +100,9 @@ class IndexPlate(OneSurface):
         found = design_gradient_index(
             blank,
             target,
-            tuple(lens["index_control"]),
-            value_of(lens, "lens.index_layers"),
-            tuple(lens["index_range"]),
+            lens.index_control,
+            lens.index_layers,
+            lens.index_range,
             cells=transport_cells(stage.rays, False),
             iterations=total,
             rays=stage.rays,
@@ -120,14 +120,14 @@ class IndexPlate(OneSurface):
             if done == total
             else "no progress"
         )
-        flat = torch.full(tuple(lens["control"]), float(self.scene.lens.offset.thickness), dtype=torch.float64)
+        flat = torch.full(lens.control, float(self.scene.lens.offset.thickness), dtype=torch.float64)
         seconds = rows[-1][-1] if rows else 0.0
         state = State(flat, iteration=done, total=done, history=rows, seconds=seconds, reason=reason)
         return found.index.coefficients.numpy(), state
 
-    def words(self, lens: dict[str, Any]) -> str:
+    def words(self, lens: LensSettings) -> str:
         """What is designed, before it is."""
         return (
-            f"index: {lens['index_control'][0]} x {lens['index_control'][1]} x {value_of(lens, 'lens.index_layers')} control values"
-            f" of {lens['index_range'][0]:.4g} to {lens['index_range'][1]:.4g}, {self.stages[-1].rays:,} rays"
+            f"index: {lens.index_control[0]} x {lens.index_control[1]} x {lens.index_layers} control values"
+            f" of {lens.index_range[0]:.4g} to {lens.index_range[1]:.4g}, {self.stages[-1].rays:,} rays"
         )

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config.default_stages import Table, each_lenslet
-from caustic_cli.config.settings import Settings, value_of
+from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.lenslets import NEEDS_DISTANT_SOURCE, array_objective, initial_array, lenslets
@@ -39,7 +39,7 @@ class LensletArray(OneSurface):
 
     @classmethod
     def applies(cls, s: Settings) -> bool:
-        return max(value_of(s["lens"], "lens.array")) > 1
+        return max(s.lens.array) > 1
 
     @classmethod
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
@@ -49,12 +49,12 @@ class LensletArray(OneSurface):
     @classmethod
     def refuse_settings(cls, d: Defaults) -> None:
         super().refuse_settings(d)
-        if d.design["start"] == "offset" or not d.plain:
+        if d.design.start == "offset" or not d.plain:
             raise InputError(
                 "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none"
                 " and optimizer lbfgs"
             )
-        if d.design["start"] == "transport" and not d.source.distant:
+        if d.design.start == "transport" and not d.source.distant:
             raise InputError(NEEDS_DISTANT_SOURCE)
 
     @classmethod
@@ -63,28 +63,25 @@ class LensletArray(OneSurface):
 
     @classmethod
     def exact_start(cls, d: Defaults) -> bool:
-        return d.plain and d.design["start"] != "offset"
+        return d.plain and d.design.start != "offset"
 
     @classmethod
     def complete_control(cls, d: Defaults) -> None:
         super().complete_control(d)
-        control = d.lens["control"]
-        fits = [
-            array_control(n, p, k) if k > 1 else n
-            for n, p, k in zip(control, d.lens["degree"], value_of(d.lens, "lens.array"), strict=True)
-        ]
+        control = d.lens.control
+        fits = [array_control(n, p, k) if k > 1 else n for n, p, k in zip(control, d.lens.degree, d.lens.array, strict=True)]
         if d.own_control and fits != list(control):
             raise InputError(
                 "⟨lens.control⟩ of an array must be lenslets times (spans + degree - 1) and one more along each axis, such as"
                 f" {fits[0]} x {fits[1]}, got {control[0]} x {control[1]}"
             )
-        d.lens["control"] = fits
+        d.set_control(fits)
 
     @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
         stages = cls.refinement(d)
-        if value_of(d.s["target"], "target.sheet"):
-            stages = each_lenslet(stages, math.prod(value_of(d.lens, "lens.array")), d.resolution)
+        if d.s.target.sheet:
+            stages = each_lenslet(stages, math.prod(d.lens.array), d.resolution)
         return stages
 
     def takes_lenslets(self, k: int) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from caustic_cli.config.default_stages import Table, refinement
-from caustic_cli.config.settings import Settings, value_of
+from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.objective import LossOfHeights
@@ -44,26 +44,26 @@ class NetworkOverRange(OneSurface):
 
     @classmethod
     def applies(cls, s: Settings) -> bool:
-        return bool(value_of(s["design"], "design.over").strip()) and super().applies(s)
+        return bool(s.design.over.strip()) and super().applies(s)
 
     @classmethod
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
-        return {"ranges": Ranges.parse(value_of(described.settings["design"], "design.over"))}
+        return {"ranges": Ranges.parse(described.settings.design.over)}
 
     @classmethod
     def complete(cls, d: Defaults) -> None:
         super().complete(d)
-        _refuse_idle_inputs(d.trained, d.design["initial"])
-        if d.design.get("robust"):
+        _refuse_idle_inputs(d.trained, d.design.initial)
+        if d.design.robust:
             raise InputError("⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already")
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:
-        return [DEFAULT_SPANS + p for p in d.lens["degree"]]
+        return [DEFAULT_SPANS + p for p in d.lens.degree]
 
     @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
-        last = refinement(tuple(d.lens["control"]), d.sampled, d.resolution, d.quality)[-1]
+        last = refinement(d.lens.control, d.sampled, d.resolution, d.quality)[-1]
         return [last | {"iterations": OVER_ITERATIONS, "tolerance": 0.0}]
 
     def check(self) -> None:

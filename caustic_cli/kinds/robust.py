@@ -17,7 +17,7 @@ from caustic_cli.scene.tolerances import Tolerances
 
 
 def _tolerances(s: Settings) -> Tolerances | None:
-    return content(s["design"], "robust", Tolerances)
+    return content(s.design, "robust", Tolerances)
 
 
 class RobustSurface(OneSurface):

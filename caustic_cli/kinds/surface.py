@@ -52,7 +52,7 @@ from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
-from caustic_cli.optics.waves import NoWaveImage
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace
@@ -115,13 +115,13 @@ class OneSurface(Problem):
         Raises:
             InputError: a value is out of range, or two contradict each other.
         """
-        asked = check("design.waves", d.design["waves"])
-        d.design.setdefault("start", cls.default_start(d))
+        asked = check("design.waves", d.design.waves)
+        d.fill_design(start=cls.default_start(d))
         cls.refuse_settings(d)
         cls.complete_control(d)
-        d.design.setdefault("preconditioner", "laplacian" if d.plain else "none")
+        d.fill_design(preconditioner="laplacian" if d.plain else "none")
         if d.complete_given_stages():
-            if asked != "auto" and any(stage.get("waves") for stage in d.design["stages"]) != (asked == "on"):
+            if asked != "auto" and any(stage.waves for stage in d.design.stages) != (asked == "on"):
                 raise InputError(
                     f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
                     + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves")
@@ -129,9 +129,9 @@ class OneSurface(Problem):
             return
         waves = wave_stages(d.s, d.source, d.quality, d.lit)
         stages = cls.default_stages(d, waves) + waves
-        if d.design["loss"].strip() == "rms":  # eq. 5.2.1 is defined on the screen only
+        if d.design.loss.strip() == "rms":  # eq. 5.2.1 is defined on the screen only
             stages = [stage | {"apron": 0} for stage in stages]
-        d.design["stages"] = stages
+        d.set_stages(stages)
 
     @classmethod
     def default_start(cls, d: Defaults) -> str:
@@ -145,7 +145,7 @@ class OneSurface(Problem):
         Raises:
             InputError: there is one.
         """
-        if d.design["start"] != "offset" and d.trained and not relative_to_initial(d.design):
+        if d.design.start != "offset" and d.trained and not relative_to_initial(d.design):
             raise InputError(
                 f"⟨design.start⟩ {d.design['start']} gives a surface, from which a network can start only with"
                 " ⟨+design.preconditioner⟩ laplacian; use that, start offset, or network none"
@@ -165,13 +165,13 @@ class OneSurface(Problem):
     def exact_start(cls, d: Defaults) -> bool:
         """Whether the initial surface is accurate at every scale: by transport, for a point source or plane wave, if the net
         resolves it, and for an extended source that shifts the image, apart from its blur.  Otherwise stages are coarse to fine."""
-        return d.plain and cls.fine_net(d) and d.design["start"] != "offset" and (d.source.sharp or cls.spread(d))
+        return d.plain and cls.fine_net(d) and d.design.start != "offset" and (d.source.sharp or cls.spread(d))
 
     @classmethod
     def complete_control(cls, d: Defaults) -> None:
         """Complete the control net."""
         if not d.own_control:
-            d.lens["control"] = cls.default_control(d)
+            d.set_control(cls.default_control(d))
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:
@@ -179,7 +179,7 @@ class OneSurface(Problem):
         if d.trained:
             return [NETWORK_CONTROL] * 2
         spans = refinement_spans(max(d.resolution), d.quality) if cls.exact_start(d) else DEFAULT_SPANS
-        return [spans + p for p in d.lens["degree"]]
+        return [spans + p for p in d.lens.degree]
 
     @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
@@ -188,10 +188,10 @@ class OneSurface(Problem):
         if cls.exact_start(d):
             return cls.refinement(d, cls.creased(d, waves))
         if d.plain and "knots_u" not in lens:
-            return coarse_to_fine(tuple(lens["control"]), lens["degree"], d.sampled, d.resolution, d.quality, sampler=d.sampler)
+            return coarse_to_fine(lens.control, lens.degree, d.sampled, d.resolution, d.quality, sampler=d.sampler)
         return [
             on_rays(
-                lens["control"],
+                lens.control,
                 d.sampled,
                 d.sampler,
                 apron=math.ceil(0.04 * max(d.resolution)),
@@ -207,10 +207,10 @@ class OneSurface(Problem):
         Diffraction smooths creases more than a coarser net, and the pixels of a tilted screen do not coincide with those that the
         map is solved for, which shows as lines: a flame at 30 degrees has an error of 0.205 on the finer net and 0.087 without.
         """
-        aligned = d.source.distant and build_screen(d.s).upright
+        aligned = d.source.distant and build_screen(d.s.screen).upright
         creased = d.gaps >= GAPS and not (d.own_control or waves or cls.spread(d)) and aligned
         if creased:
-            d.lens["control"] = [creased_control(max(d.resolution), p, d.quality) for p in d.lens["degree"]]
+            d.set_control([creased_control(max(d.resolution), p, d.quality) for p in d.lens.degree])
         return creased
 
     @classmethod
@@ -218,8 +218,7 @@ class OneSurface(Problem):
         """The stages after a transport start."""
         spread = cls.spread(d)
         centre = d.source.pointlike() if spread else d.source
-        control = tuple(d.lens["control"])
-        return refinement(control, d.rays, d.resolution, d.quality, not centre.collimated, spread, creased)
+        return refinement(d.lens.control, d.rays, d.resolution, d.quality, not centre.collimated, spread, creased)
 
     # Numerics
 

@@ -50,7 +50,7 @@ class TwoSides(SeveralSurfaces):
 
     @classmethod
     def applies(cls, s: Settings) -> bool:
-        return "second" in s
+        return s.second is not None
 
     @classmethod
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
@@ -59,23 +59,24 @@ class TwoSides(SeveralSurfaces):
 
     @classmethod
     def complete(cls, d: Defaults) -> None:
-        design, asked = d.design, check("design.waves", d.design["waves"])
-        if design.setdefault("start", "transport") != "transport":
-            raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {design['start']}")
+        asked = check("design.waves", d.design.waves)
+        d.fill_design(start="transport")
+        if d.design.start != "transport":
+            raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {d.design.start}")
         if asked == "on":
             raise InputError("⟨design.waves⟩ on: two free-form sides are refined by rays alone")
         cls.complete_control(d)
-        design.setdefault("preconditioner", "laplacian")
+        d.fill_design(preconditioner="laplacian")
         if not d.complete_given_stages():
-            design["stages"] = two_sided(tuple(d.lens["control"]), d.rays, d.resolution, d.quality)
-        elif any(stage.get(key) for stage in design["stages"] for key in ("waves", "spread")):
+            d.set_stages(two_sided(d.lens.control, d.rays, d.resolution, d.quality))
+        elif any(stage.get(key) for stage in d.design.stages for key in ("waves", "spread")):
             raise InputError(
                 "[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread"
             )
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:
-        return [min(TWO_SIDED_SPANS, refinement_spans(max(d.resolution), d.quality)) + p for p in d.lens["degree"]]
+        return [min(TWO_SIDED_SPANS, refinement_spans(max(d.resolution), d.quality)) + p for p in d.lens.degree]
 
     @property
     def half_sizes(self) -> list[tuple[float, float]]:

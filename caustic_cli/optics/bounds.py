@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError, at_most
-from caustic_cli.optics.gradient.fields import index_field_of
 from caustic_cli.optics.interface import reflectance, reflectances
+from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -32,31 +32,38 @@ from caustic_cli.scene import Scene
 
 
 @dataclass(frozen=True)
+class ExitBounds:
+    """Bounds over all rays at the exit surface."""
+
+    #: Of the surface.
+    slope: float
+    #: n sin i, below 1 there is no total internal reflection.
+    critical: float
+    #: Slope bound times the tangent of the exit ray's angle, below 1 there is no secondary intersection.
+    slope_ratio: float
+    #: Distance of rays from the axis at the greatest height, in half widths of the aperture.
+    reach: float
+
+
+@dataclass(frozen=True)
 class Bounds:
-    """Bounds over all rays; see the module.  Angles in rad, slopes dimensionless, heights in mm.
+    """Bounds over all rays; see the module.  Angles in rad, slopes dimensionless, heights in mm."""
 
-    incidence, inside: angle of rays to z in front of and behind the entrance; slope: of the surface; lean: angle of the
-    microfacets' normals to z; index: largest over all wavelengths; critical: n sin i, below 1 there is no total internal
-    reflection; slope_ratio: slope bound times the tangent of the exit ray's angle, below 1 there is no secondary intersection;
-    reach: distance of rays from the axis at the greatest height, in half widths of the aperture; ghost: fraction of the power that
-    is reflected twice inside;
-    depth: of the glass, mm; ghost_error: estimate of the relative RMS that this light adds to the image, see `ghost_error`;
-    polarised: for unpolarised light, the change of the exit's reflectance by the polarisation acquired at the entrance; resolution:
-    limit set by diffraction, source and pixels.
-    """
-
+    #: Angle of rays to z in front of and behind the entrance.
     incidence: float
     inside: float
-    slope: float
-    lean: float
+    exit: ExitBounds
+    #: Largest over all wavelengths.
     index: float
-    critical: float
-    slope_ratio: float
-    reach: float
-    ghost: float
+    #: Of the glass, mm.
     depth: float
+    #: Fraction of the power that is reflected twice inside; estimate of the relative RMS that this light adds to the image, see
+    #: `ghost_error`.
+    ghost: float
     ghost_error: float
+    #: For unpolarised light, the change of the exit's reflectance by the polarisation acquired at the entrance.
     polarised: float
+    #: Limit set by diffraction, source and pixels.
     resolution: Resolution
 
 
@@ -67,9 +74,9 @@ def check_exit_above_entrance(scene: Scene, field: HeightField, heights: Tensor)
         InputError: giving the depth by which it does.
     """
     lens = scene.lens
-    if lens.mirror or float(heights.min()) >= lens.z_in:  # the convex hull of the net contains the surface
+    if float(heights.min()) >= lens.interaction.base(lens.z_in):  # the convex hull of the net contains the surface
         return
-    dip = lens.z_in - field.least(heights, lens.round)
+    dip = lens.z_in - field.least(heights, lens.opening)
     if dip > 0:
         raise InputError(
             f"⟨lens.z_in⟩ of {lens.z_in:g} mm lies above a part of the exit surface, which dips {dip:.3g} mm below it; it must"
@@ -82,28 +89,26 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
     least, most = min(indices), max(indices)
     pupil = scene.pupil
-    incidence = _through(scene, scene.source.incidence(pupil.half_size, pupil.z, pupil.round))
-    bent, depth = 0.0, float(heights.max()) - lens.z_in
-    if field_of_index := index_field_of(lens):
-        low, high, steepest = field_of_index.extremes(lens.half_size, depth)
-        least, most = least * low / lens.index, most * high / lens.index
-        bent = steepest * depth / low
+    incidence = _through(scene, scene.source.incidence(pupil))
+    depth = float(heights.max()) - lens.z_in
+    low, high, steepest = medium_of(lens).variation(lens.half_size, depth)
+    least, most, bent = least * low, most * high, steepest * depth / (low * lens.index)
     front = 0.0 if lens.entrance is None else math.atan(math.hypot(*entrance_of(lens).slope_bounds(None)))
     inside = min(front + math.asin(max(-1.0, min(1.0, math.sin(incidence - front) / least))) + bent, 0.5 * math.pi)
-    slope = field.slope_bound(heights) + steeper
-    lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)
-    i = inside + lean
-    if lens.mirror:
-        critical, out = 0.0, inside + 2.0 * lean
-    else:
-        critical = most * math.sin(min(i, math.pi / 2.0))
-        out = inside + math.asin(critical) - i if critical < 1.0 else math.pi / 2.0
+    exit = _exit(scene, inside, field.slope_bound(heights) + steeper, most, heights)
+    ghost = _ghost(scene, field, heights, inside + front, most)
+    focused = ghost_error(scene, field, heights, ghost, most)
+    polarised, seen = _polarised(incidence + front, exit.critical, most), Resolution.at(scene, field, heights)
+    return Bounds(incidence, inside, exit, most, depth, ghost, focused, polarised, seen)
+
+
+def _exit(scene: Scene, inside: float, slope: float, most: float, heights: Tensor) -> ExitBounds:
+    """Bounds at the exit, from the angle of rays inside, the slope bound and the largest index."""
+    lens = scene.lens
+    lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)  # of the microfacets' normals to z
+    critical, out = lens.interaction.leaving_bounds(inside, lean, most)
     slope_ratio = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
-    reach = _reach(scene, inside, float(heights.min()), float(heights.max()))
-    ghost, polarised = _ghost(scene, field, heights, inside + front, most), _polarised(incidence + front, critical, most)
-    focused = 0.0 if scene.two_sided or scene.elements else ghost_error(scene, field, heights, ghost, most)
-    seen = Resolution.at(scene, field, heights)
-    return Bounds(incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, depth, focused, polarised, seen)
+    return ExitBounds(slope, critical, slope_ratio, _reach(scene, inside, float(heights.min()), float(heights.max())))
 
 
 def _through(scene: Scene, lean: float) -> float:
@@ -142,24 +147,20 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     drift = (top - lens.z_in - low) * math.tan(min(inside, 1.57))
     if source.distant:
         return 1.0 + drift / min(lens.half_size)
-    positions, extent, cone = source.points()[0], source.extent, source.cone_over(lens.half_size, lens.z_in, lens.round)
+    positions, extent, cone = source.points()[0], source.extent, source.cone_over(lens.pupil)
     wide = (lens.z_in - positions[:, 2]) * math.tan(cone) if cone < math.pi / 2.0 else np.full(len(positions), math.inf)
-    if lens.round:
-        far = np.hypot(*(np.abs(positions[:, k]) + extent[k] for k in (0, 1))) + wide
-        return float((np.minimum(far, lens.half_size[0]) + drift).max()) / lens.half_size[0]
-    return max(
-        float(((np.minimum(np.abs(positions[:, k]) + extent[k] + wide, r) + drift) / r).max()) for k, r in enumerate(lens.half_size)
-    )
+    far = lens.opening.distances(*(np.abs(positions[:, k]) + extent[k] for k in (0, 1)))
+    return max(float(((np.minimum(d + wide, r) + drift) / r).max()) for d, r in far)
 
 
 def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: float) -> float:
     """Bound of the fraction of the power that is reflected at the exit and then at the entrance: an average over the knot spans for
     a uniform plane wave, their maximum for other light."""
     lens, kind = scene.lens, scene.lens.fresnel
-    if lens.mirror:
+    if "ghosts" in lens.interaction.lacks:
         return 0.0
     if scene.elements:  # of every pair of refracting surfaces, at normal incidence
-        surfaces, n = 2 + sum(len(e.sides) for e in scene.elements if not e.mirror), max(n, *(e.index for e in scene.elements))
+        surfaces, n = 2 + sum(len(e.refracting) for e in scene.elements), max(n, *(e.index for e in scene.elements))
         return 0.0 if kind == "none" else surfaces * (surfaces - 1) / 2 * ((n - 1.0) / (n + 1.0)) ** 4
     slope, area = _slopes(field, heights.detach().double().cpu())
     lean = torch.atan(slope + lens.roughness * LARGEST_NORMAL)
@@ -178,22 +179,23 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
         return torch.where(square > 0, value, torch.ones_like(value))
 
     both = part(inside + lean) * part(inside + 2.0 * lean)
-    even = scene.axial and scene.source.profile is None and not lens.round
+    even = scene.axial and scene.source.profile is None and not lens.opening.round
     return float((both * area).sum() if even else both.max())
 
 
 def ghost_error(scene: Scene, field: HeightField, heights: Tensor, part: float, n: float) -> float:
-    """Estimate of the relative RMS that the first ghost adds to the image if it carries the fraction `part` of the power; n: index.
+    """Estimate of the relative RMS that the first ghost adds to the image if it carries the fraction `part` of the power; n: index;
+    0 for a scene without `paraxial` data.
 
     To first order a slope g deflects light by (n - 1) g and its first ghost by (3 n - 1) g.  A ghost whose map x -> X has the
     Jacobian J gives the irradiance part / (A |det J|) at X, A the aperture's area, so that over a screen of area S its mean square
     is part^2 S / A times the mean over the lens of 1 / |det J|.  The eigenvalues of J are reduced by the error of the first-order
     approximation, and bounded below by a pixel over the lens' width.
     """
-    if part == 0.0:
+    light = paraxial(scene, field, heights) if part > 0.0 else None
+    if light is None:
         return 0.0
     lens, screen = scene.lens, scene.screen
-    light = paraxial(scene, field, heights)
     gain = light.throw * (3.0 * n - 1.0)
     x, y = light.x * light.straight + gain * light.gx, light.y * light.straight + gain * light.gy
     on = ((x - screen.shift[0]).abs() <= screen.half_size[0]) & ((y - screen.shift[1]).abs() <= screen.half_size[1])

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from importlib import import_module
 
 import torch
 from torch import Tensor
@@ -56,6 +57,18 @@ class Method:
 
     def __post_init__(self):
         checks.choice("intersection method", self.name, METHODS)
+
+    def start(self, field, heights: Tensor, origin, direction, radius: float | None):
+        """Distances to the intersections with the mesh (None if not requested), and (t, status) if the mesh is the whole method."""
+        if self.name == "newton":
+            return None, None
+        mesh = import_module("caustic_cli.optics.mesh").TriangleMesh(field, heights, *self.parts)  # its search is compiled
+        rays = torch.broadcast_tensors(*(torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)))
+        start, missed, _ = mesh.intersect(*rays, self.recursive)
+        if self.name == "mesh":
+            t = torch.where(missed == 0, start, torch.zeros_like(start))
+            return start, (t, within(missed.long(), start, origin, direction, radius))
+        return start, None
 
 
 def intersect_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
@@ -115,6 +128,17 @@ def within(status: Tensor, t: Tensor, origin, direction, radius: float | None) -
     return torch.where(beyond & (status == Status.HIT), int(Status.MISSED), status)
 
 
+def _above_aperture(origin, direction, half_size: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """The interval of t in which rays are above an aperture, from 0 on; empty as (inf, ...)."""
+    enter, leave = torch.zeros_like(direction[0]), torch.full_like(direction[0], torch.inf)
+    for o, d, r in zip(origin, direction, half_size, strict=True):
+        near = torch.where(d == 0, torch.where(o.abs() <= r, -torch.inf, torch.inf), (torch.where(d > 0, -r, r) - o) / d)
+        far = torch.where(d == 0, torch.inf, (torch.where(d > 0, r, -r) - o) / d)
+        near = torch.where(o.abs() <= r, torch.full_like(near, -torch.inf), near)
+        enter, leave = torch.maximum(enter, near), torch.minimum(leave, far)
+    return enter, leave
+
+
 @torch.no_grad()
 def reference(
     surface: Surface, heights: Tensor | None, origin, direction, side: float = 1.0, radius: float | None = None
@@ -128,12 +152,7 @@ def reference(
     rx, ry = surface.half_size
     ahead = dz > 0
     dz = torch.where(ahead, dz, torch.ones_like(dz))
-    enter, leave = torch.zeros_like(dz), torch.full_like(dz, torch.inf)
-    for o, d, r in ((ox, dx, rx), (oy, dy, ry)):  # the interval in which the ray is above the aperture
-        near = torch.where(d == 0, torch.where(o.abs() <= r, -torch.inf, torch.inf), (torch.where(d > 0, -r, r) - o) / d)
-        far = torch.where(d == 0, torch.inf, (torch.where(d > 0, r, -r) - o) / d)
-        near = torch.where(o.abs() <= r, torch.full_like(near, -torch.inf), near)
-        enter, leave = torch.maximum(enter, near), torch.minimum(leave, far)
+    enter, leave = _above_aperture((ox, oy), (dx, dy), surface.half_size)
     low, top = torch.maximum((low_z - oz) / dz, enter), (high_z - oz) / dz
     high, closed = torch.minimum(leave, top), top < leave
     possible = ahead & (low <= high) & torch.isfinite(low)

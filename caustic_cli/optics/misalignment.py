@@ -141,13 +141,11 @@ class Misalignment:
         lens, since that cone changes with the source's position."""
         before = scene.source
         if before.profile is not None and changed.source.profile is not None:
-            after, whole = (mean_irradiance(one, scene.pupil.round) for one in (changed.source.profile, before.profile))
+            after, whole = (mean_irradiance(one, scene.pupil.aperture) for one in (changed.source.profile, before.profile))
             return after / whole
         if before.distant or before.cone is not None or before.rays is not None:
             return 1.0
-        after, whole = (
-            relative_flux(s.source, s.source.cone_over(s.lens.half_size, s.lens.z_in, s.lens.round)) for s in (changed, scene)
-        )
+        after, whole = (relative_flux(s.source, s.source.cone_over(s.lens.pupil)) for s in (changed, scene))
         return after / whole
 
     def directed(self, scene: Scene, source: Source, state: RayState) -> RayState:
@@ -201,10 +199,9 @@ def landing_points(
                 state = errors.directed(scene, band.scene.source, state)
                 tracer = Tracer(system, state, torch.float64, requests)
                 forward = math.copysign(1.0, sum(a * b for a, b in zip(system.axis, axes[2], strict=True)))
-                land = tracer.backend.land if shape is None else shape.land
                 for out in tracer(parameters):
                     middle = (point[0], point[1], point[2] - out.datum)
-                    x, y, there = land(out.origin, out.direction, middle, axes, forward)
+                    x, y, there = shape.land(tracer.backend, out.origin, out.direction, middle, axes, forward)
                     power = torch.where(there, out.power, torch.zeros_like(out.power)) * scale
                     yield LandingPoints(x.double(), y.double(), power.double(), band.channel)
 
@@ -220,6 +217,4 @@ def reason_ignored(scene: Scene, error: str) -> str:
         return "the source is at a finite distance; source_shift moves it"
     if error == "source_size" and not any(one.sized for one in source.members):
         return f"{source.label} has no size"
-    if error == "index" and scene.lens.mirror:
-        return "a mirror has no index"
-    return ""
+    return scene.lens.interaction.lacks.get(error, "")

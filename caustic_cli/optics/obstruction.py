@@ -17,6 +17,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import singledispatch
 
 import numpy as np
 import torch
@@ -26,14 +27,12 @@ from caustic_cli.optics.emission import Emission, rays_of
 from caustic_cli.optics.frames import IDENTITY, Axes, AxisSegment, Pose
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.screen_shape import shape_of
-from caustic_cli.scene import Component, Scene, Screen
+from caustic_cli.scene import Aperture, CircularAperture, Component, Scene, Screen
 
 #: Rays of the source, and paths between two apertures: a fraction of light below one of them is nil.
 RAYS, PATHS = 8_192, 4_096
 #: A body that only touches a path, or the ends of one, to this relative accuracy does not obstruct it.
 TOUCH = 1e-9
-#: Flat pieces of a curved screen along each axis.
-PIECES = 16
 #: Steps of the search for a shift of the screen: doublings from a hundredth of its size, then bisections, to a hundredth; and the
 #: factor by which a shift along x must be shorter than one along y.
 DOUBLINGS, BISECTIONS, SHORTER = 16, 7, 0.95
@@ -41,42 +40,29 @@ DOUBLINGS, BISECTIONS, SHORTER = 16, 7, 0.95
 
 @dataclass(frozen=True)
 class Body:
-    """A box, or a cylinder if `round`, with the name by which messages call it.
+    """A box or a cylinder, with the name by which messages call it.
 
-    origin: mm; axes: unit vectors of its frame; half_size: along x and y, mm; depth: range along z, mm.
+    origin: mm; axes: unit vectors of its frame; aperture: its outline along x and y; depth: range along z, mm.
     """
 
     name: str
     origin: tuple[float, float, float]
     axes: Axes
-    half_size: tuple[float, float]
+    aperture: Aperture
     depth: tuple[float, float] = (0.0, 0.0)
-    round: bool = False
-
-    @classmethod
-    def of(cls, name: str, pose: Pose, half_size, depth=(0.0, 0.0), round: bool = False) -> Body:
-        """A body with a pose."""
-        return cls(name, pose.position, pose.axes, half_size, depth, round)
 
     def crossed(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Whether paths from `start` to `end`, (N, 3) mm, cross it, (N,)."""
         axes = np.array(self.axes).T
         o, d = (start - self.origin) @ axes, (end - start) @ axes
-        within = [_between(o[:, 2], d[:, 2], *self.depth)]
-        if self.round:
-            within.append(_in_circle(o, d, self.half_size[0] * (1.0 - TOUCH)))
-        else:
-            within += [_between(o[:, k], d[:, k], -h * (1.0 - TOUCH), h * (1.0 - TOUCH)) for k, h in enumerate(self.half_size)]
+        within = [_between(o[:, 2], d[:, 2], *self.depth), *_inside(self.aperture, o, d)]
         enter = np.max([TOUCH * np.ones(len(o)), *(a for a, _ in within)], axis=0)
         leave = np.min([(1.0 - TOUCH) * np.ones(len(o)), *(b for _, b in within)], axis=0)
         return enter <= leave
 
     def points(self, u: np.ndarray, v: np.ndarray, z: float) -> np.ndarray:
         """Points of its aperture at u, v in [0, 1] and z of its frame, (N, 3) mm."""
-        (rx, ry), x, y = self.half_size, 2.0 * u - 1.0, 2.0 * v - 1.0
-        if self.round:
-            x, y = np.sqrt(u) * np.cos(2.0 * math.pi * v), np.sqrt(u) * np.sin(2.0 * math.pi * v)
-        return np.array(self.origin) + np.stack([rx * x, ry * y, np.full_like(x, z)], 1) @ np.array(self.axes)
+        return np.array(self.origin) + np.stack([*self.aperture.spread(u, v), np.full_like(u, z)], 1) @ np.array(self.axes)
 
 
 @dataclass(frozen=True)
@@ -92,7 +78,7 @@ class ScreenBody:
     @property
     def pieces(self) -> list[Body]:
         """Its pieces."""
-        (hx, hy), k = self.screen.half_size, PIECES if self.screen.curved else 1
+        (hx, hy), k = self.screen.half_size, shape_of(self.screen).pieces
         x, y = (np.linspace(-h, h, k + 1) for h in (hx, hy))
         p = self._at(x[:, None], y[None, :])
         found = []
@@ -103,7 +89,7 @@ class ScreenBody:
             wide, tall = np.linalg.norm(a), np.linalg.norm(b)
             axes = tuple(tuple(map(float, axis)) for axis in (a / wide, np.cross(n, a / wide), n))
             middle = tuple(map(float, corners.mean((0, 1))))
-            found.append(Body(self.name, middle, axes, (float(wide) / 2.0, float(tall) / 2.0)))  # type: ignore[arg-type]
+            found.append(Body(self.name, middle, axes, Aperture((float(wide) / 2.0, float(tall) / 2.0))))  # type: ignore[arg-type]
         return found
 
     def crossed(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -117,9 +103,8 @@ class ScreenBody:
 
     def _at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Points in space, (..., 3) mm, from its own coordinates, measured from its centre."""
-        shape, (sx, sy) = shape_of(self.screen), self.screen.shift
-        x, y = np.broadcast_arrays(x, y)
-        s = np.zeros_like(x) if shape is None else shape.at(x, y)[0]
+        (sx, sy), (x, y) = self.screen.shift, np.broadcast_arrays(x, y)
+        s = shape_of(self.screen).at(x, y)[0]
         axes = Pose(tilt=self.screen.tilt, frame=self.leg.frame).axes
         return np.array(self.leg.at(sx, sy, self.screen.z)) + np.stack([x, y, s], -1) @ np.array(axes)
 
@@ -228,8 +213,15 @@ def _between(o: np.ndarray, d: np.ndarray, low: float, high: float) -> tuple[np.
     return enter, np.where(still, -enter, np.maximum(a, b))
 
 
-def _in_circle(o: np.ndarray, d: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Range of t in which (x, y) of o + t d is within a circle about the origin, empty as (inf, -inf)."""
+@singledispatch
+def _inside(aperture: Aperture, o: np.ndarray, d: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Ranges of t in all of which (x, y) of o + t d is within an aperture, empty as (inf, -inf)."""
+    return [_between(o[:, k], d[:, k], -h * (1.0 - TOUCH), h * (1.0 - TOUCH)) for k, h in enumerate(aperture.half_size)]
+
+
+@_inside.register(CircularAperture)
+def _(aperture: CircularAperture, o: np.ndarray, d: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    radius = aperture.radius * (1.0 - TOUCH)
     a, b, c = (d[:, :2] ** 2).sum(1), (o[:, :2] * d[:, :2]).sum(1), (o[:, :2] ** 2).sum(1) - radius * radius
     root = b * b - a * c
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -237,7 +229,7 @@ def _in_circle(o: np.ndarray, d: np.ndarray, radius: float) -> tuple[np.ndarray,
         enter, leave = (-b - way) / a, (-b + way) / a
     still, missed = a == 0.0, root < 0.0
     enter = np.where(still, np.where(c <= 0.0, -np.inf, np.inf), np.where(missed, np.inf, enter))
-    return enter, np.where(still, -enter, np.where(missed, -np.inf, leave))
+    return [(enter, np.where(still, -enter, np.where(missed, -np.inf, leave)))]
 
 
 def _stations(scene: Scene) -> tuple[list[Body], ScreenBody]:
@@ -245,19 +237,17 @@ def _stations(scene: Scene) -> tuple[list[Body], ScreenBody]:
     lens, leg = scene.lens, AxisSegment()
 
     def body(number: int, part: Component) -> Body:
-        name = f"the {part.kind} of [[element]] {number + 1}"
-        low, high = part.extent
-        return Body.of(name, leg.pose(part.z, part.tilt), part.half_size, (low - part.z, high - part.z), part.round)
+        pose, (low, high) = leg.pose(part.z, part.tilt), part.extent
+        name, depth = f"the {part.kind} of [[element]] {number + 1}", (low - part.z, high - part.z)
+        return Body(name, pose.position, pose.axes, part.opening, depth)
 
     found = [body(k, part) for k, part in enumerate(scene.before)]
-    wide, high = (h + lens.border for h in lens.half_size)
-    top = lens.offset.thickness
-    depth = (top, top) if lens.mirror else (lens.lowest, max(lens.lowest, top))
-    name = "the mirror" if lens.mirror else "the free-form lens" if scene.elements else "the lens"
-    found.append(Body.of(name, Pose(), (wide, high), depth, lens.round))
+    name = "the free-form lens" if scene.elements else f"the {lens.kind}"
+    depth = lens.interaction.extent(lens.lowest, lens.offset.thickness)
+    found.append(Body(name, (0.0, 0.0, 0.0), IDENTITY, lens.opening.grown(lens.border), depth))
     for k, part in enumerate(scene.behind, len(scene.before)):
         found.append(body(k, part))
-        leg = leg.folded(part.z, part.tilt) if part.mirror else leg
+        leg = part.axis_behind(leg)
     return found, ScreenBody(scene.screen, leg)
 
 
@@ -271,7 +261,8 @@ def _sources(scene: Scene) -> list[Body]:
         x, y, z = (float(c) for c in (places.max(0) + places.min(0)) / 2.0)
         wide, high = (float(np.ptp(places[:, k])) / 2.0 + extent[k] for k in (0, 1))
         if min(wide, high) > 0:
-            found.append(Body("the source", (x, y, z), IDENTITY, (wide, high), round=wide == high and len(places) == 1))
+            outline = CircularAperture if wide == high and len(places) == 1 else Aperture
+            found.append(Body("the source", (x, y, z), IDENTITY, outline((wide, high))))
     return found
 
 

@@ -66,7 +66,11 @@ def compile_plan(
         steeper: by how much slopes of the traced surface may exceed those of the spline.
     """
     bounds = bounds_of(scene, field, heights, steeper)
-    decisions = [effect.decide(scene, bounds) for effect in EFFECTS]
+    lacks = scene.lens.interaction.lacks
+    decisions = [
+        Decision(effect.name, False, lacks[effect.name], present=False) if effect.name in lacks else effect.decide(scene, bounds)
+        for effect in EFFECTS
+    ]
     if wanted is not None:
         chosen = frozenset(wanted)
         decisions = [

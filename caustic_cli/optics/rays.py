@@ -28,7 +28,7 @@ LOSSES = ("missed_lens", "missed_surface", "total_internal_reflection", "fresnel
 Vector = tuple
 
 
-class Status(IntEnum):
+class RayStatus(IntEnum):
     """Outcome of a ray in front of the screen."""
 
     OK = 0
@@ -39,24 +39,24 @@ class Status(IntEnum):
 
 @dataclass
 class RayState:
-    """Rays at one stage of a trace.
-
-    origin, direction, power, path, polarised (E): see the module; status: (N,) int64, a `Status` each, None while all are OK; lost:
-    power lost so far, by name, see LOSSES; wavelength: nm, None if no medium needs it; sample: points of the aperture through which
-    the rays of a plane wave pass while they are still parallel to the axis; datum: mm; leaving: power behind the last element, for
-    rays on a screen.
-    """
+    """Rays at one stage of a trace; see the module."""
 
     origin: Vector
     direction: Vector
     power: Tensor
     path: Tensor | float = 0.0
+    #: E.
     polarised: Vector | None = None
+    #: (N,) int64, a `RayStatus` each; None while all are OK.
     status: Tensor | None = None
+    #: Power lost so far, by name, see LOSSES.
     lost: dict[str, Tensor | float] = field(default_factory=dict)
+    #: nm; None if no medium needs it.
     wavelength: float | None = None
+    #: Points of the aperture through which the rays of a plane wave pass while they are still parallel to the axis.
     sample: Sample | None = None
     datum: float = 0.0
+    #: Power behind the last element, for rays on a screen.
     leaving: Tensor | None = None
 
     @property
@@ -81,13 +81,13 @@ class RayState:
         """Add an amount of power to the account of losses under `name`."""
         self.lost[name] = self.lost.get(name, 0.0) + amount
 
-    def mark(self, where: Tensor, status: Status) -> None:
+    def mark(self, where: Tensor, status: RayStatus) -> None:
         """Set the status of the rays `where` that are still OK."""
         before = torch.zeros(where.shape, dtype=torch.int64, device=where.device) if self.status is None else self.status
-        self.status = torch.where(where & (before == Status.OK), int(status), before)
+        self.status = torch.where(where & (before == RayStatus.OK), int(status), before)
 
     def statuses(self) -> Tensor:
-        """A `Status` for every ray, (N,) int64."""
+        """A `RayStatus` for every ray, (N,) int64."""
         if self.status is None:
             return torch.zeros(self.power.shape, dtype=torch.int64, device=self.power.device)
         return self.status
@@ -138,3 +138,17 @@ class RayState:
             u, v = (torch.broadcast_to(c, s.shape).reshape(-1) for c in (s.u[:, None], s.v[None, :]))
             s = replace(s, u=u, v=v, tensor=False)
         return replace(self, origin=(x, y, self.origin[2]), power=power, sample=s, lost=dict(self.lost))
+
+
+@dataclass
+class Hit:
+    """Where rays meet a surface, in its element's frame."""
+
+    #: Points of intersection, mm.
+    local: tuple
+    #: Unit directions in front of the surface.
+    incoming: tuple
+    #: Slopes of the surface.
+    slopes: tuple
+    #: Length of the path to it, mm.
+    length: Tensor | float = 0.0

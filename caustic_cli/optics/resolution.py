@@ -15,6 +15,7 @@ from torch import Tensor
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.scene import Lens, Scene
+from caustic_cli.scene.features import ELEMENTS, FREE_ENTRANCE, features_of
 
 #: Wavelength, nm, that represents light of unspecified wavelength, and the band of white light.
 GREEN, BAND = 550.0, (450.0, 650.0)
@@ -78,9 +79,10 @@ class Resolution:
     def at(cls, scene: Scene, field: HeightField, heights: Tensor) -> Resolution:
         """Of a lens with heights (n, m) mm, from its local magnification, with the screen for the picture; with two free-form sides
         or other elements from the nominal magnification."""
-        if scene.two_sided or scene.elements:
+        magnification = local_magnification(scene, field, heights)
+        if magnification is None:
             return cls.before(scene, scene.screen.size)
-        return cls.of(scene, scene.screen.size[0], local_magnification(scene, field, heights))
+        return cls.of(scene, scene.screen.size[0], magnification)
 
     @property
     def blur(self) -> float:
@@ -148,9 +150,12 @@ def _seen_from(lens: Lens) -> float:
     return lens.z_in + (lens.offset.thickness - lens.z_in) / lens.inside
 
 
-def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial:
-    """Paraxial data of a scene's lens with heights (n, m) mm at POINTS^2 points, for light from the source's centre."""
+def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial | None:
+    """Paraxial data of a scene's lens with heights (n, m) mm at POINTS^2 points, for light from the source's centre; None if its
+    exit alone does not determine where light lands."""
     lens = scene.lens
+    if features_of(scene, (FREE_ENTRANCE, ELEMENTS)):
+        return None
     distance = abs(scene.screen.z - lens.offset.thickness)
     vergence = 0.0 if scene.source.distant else 1.0 / (_seen_from(lens) - scene.source.centre[2])
     line = (torch.arange(POINTS, dtype=torch.float64, device=heights.device) + 0.5) * (2.0 / POINTS) - 1.0
@@ -159,12 +164,15 @@ def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial:
     return Paraxial(x, y, gx, gy, xx, xy, yy, distance, 1.0 + distance * vergence)
 
 
-def local_magnification(scene: Scene, field: HeightField, heights: Tensor) -> float:
-    """Square root of the mean areal magnification |det dX/ds|: paraxial, from the surface's second derivatives.
+def local_magnification(scene: Scene, field: HeightField, heights: Tensor) -> float | None:
+    """Square root of the mean areal magnification |det dX/ds|: paraxial, from the surface's second derivatives; None where there
+    is no such data.
 
     Light from s lands at X = s (1 + L / a) + L g grad h, a the distance of the source and g = n - 1, or 2 for a mirror.
     """
     light = paraxial(scene, field, heights)
-    gain = light.throw * (2.0 if scene.lens.mirror else scene.lens.index - 1.0)
+    if light is None:
+        return None
+    gain = light.throw * abs(scene.lens.effective_index - 1.0)
     xx, xy, yy = gain * light.xx, gain * light.xy, gain * light.yy
     return float(((light.straight + xx) * (light.straight + yy) - xy * xy).abs().mean().sqrt())

@@ -16,13 +16,14 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
+from caustic_cli.scene import Aperture
 
 #: Samplers with tensor-product structure, and all samplers.
 TENSOR = ("grid", "lines")
@@ -152,7 +153,7 @@ class Sampler:
         shape: cells (nu, nv) along u and v; nu * nv rays.
         seed: of the random kinds.
         profile: relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3).
-        round: whether the aperture is the inscribed circle.
+        aperture: of any half widths.
         device: where the samples live.
     """
 
@@ -161,7 +162,7 @@ class Sampler:
     seed: int = 0
     profile: Tensor | None = None
     device: str | torch.device = "cpu"
-    round: bool = False
+    aperture: Aperture = field(default_factory=Aperture)
 
     def __post_init__(self):
         if self.kind not in SAMPLERS:
@@ -188,7 +189,7 @@ class Sampler:
 
         With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
         """
-        norm, even = 1.0 / self.count, self.profile is None and not self.round
+        norm, even = 1.0 / self.count, self.profile is None and not self.aperture.round
         if not even:
             total = sum(float(self._irradiance(s).sum()) for s in self._points(size))
             if not total > 0:
@@ -216,11 +217,9 @@ class Sampler:
             yield Sample(u, v, False, one)
 
     def _irradiance(self, s: Sample) -> Tensor:
-        if self.round:
-            across, along = (2.0 * s.u - 1.0) ** 2, (2.0 * s.v - 1.0) ** 2
-            within = ((across[:, None] + along[None, :] if s.tensor else across + along) <= 1.0).double()
-            return within if self.profile is None else within * self._profile(s)
-        return self._profile(s)
+        u, v = 2.0 * s.u - 1.0, 2.0 * s.v - 1.0
+        within = self.aperture.covers(u[:, None], v[None, :]) if s.tensor else self.aperture.covers(u, v)
+        return within.double() if self.profile is None else within * self._profile(s)
 
     def _profile(self, s: Sample) -> Tensor:
         assert self.profile is not None

@@ -19,9 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.surfaces import Cylinder, HeightField, Sphere, Surface
+from caustic_cli.optics.surfaces import HeightField, Sphere, Surface
+from caustic_cli.optics.surfaces.cylinder import Cylinder
 from caustic_cli.scene import Screen
-from caustic_cli.scene.screen import Sags
+from caustic_cli.scene.screen import PLANE, Sags
 
 #: Extension of a measured shape beyond each border, as a fraction of its width, by point reflection: it catches light off the
 #: screen.
@@ -32,15 +33,32 @@ GAUSS = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
 SURVEY = 129
 
 
+class PlaneScreen:
+    """The shape of a plane screen, in the screen's frame; curved ones are subclasses."""
+
+    #: Flat pieces along each axis by which it is represented where a plane is needed.
+    pieces = 1
+
+    def land(self, backend, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Landing points of rays: arguments and results as for the backend's `land`, with the screen's centre for `point`."""
+        return backend.land(origin, direction, point, axes, forward)
+
+    def at(self, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+        """S, S_x and S_y at points of a common shape, float64."""
+        return [np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))] * 3
+
+
 @dataclass(frozen=True, eq=False)
-class ScreenShape:
+class CurvedScreen(PlaneScreen):
     """A surface in the screen's frame, with its control heights if it has any."""
 
     surface: Surface
     heights: Tensor | None = None
 
-    def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Landing points of rays: arguments and results as for the backends' `land`, with the screen's centre for `point`."""
+    pieces = 16
+
+    def land(self, backend, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
+        """By intersection with the surface, whatever the backend."""
         like = next(c for c in (*origin, *direction) if isinstance(c, Tensor))
         o = tuple(_dot([_double(c) - p for c, p in zip(origin, point, strict=True)], axis) for axis in axes)
         d = tuple(_dot([_double(c) for c in direction], axis) for axis in axes)
@@ -65,28 +83,30 @@ def _dot(vector: Sequence, axis: Sequence[float]):
     return sum(c * a for c, a in zip(vector, axis, strict=True))
 
 
-def shape_of(screen: Screen) -> ScreenShape | None:
-    """The shape of a screen; None for a plane one."""
-    return _made(tuple(screen.radius), screen.sags) if screen.curved else None
-
-
 @lru_cache(maxsize=16)
-def _made(radius: tuple[float, float], sags: Sags | None) -> ScreenShape:
+def _shape(radius: tuple[float, float], sags: Sags | None) -> PlaneScreen:
+    if radius == PLANE and sags is None:
+        return PlaneScreen()
     if sags is None:
         if radius[0] == radius[1]:
-            return ScreenShape(Sphere(radius[0]))
+            return CurvedScreen(Sphere(radius[0]))
         bent = 0 if math.isfinite(radius[0]) else 1
-        return ScreenShape(Cylinder(radius[bent], bent))
+        return CurvedScreen(Cylinder(radius[bent], bent))
     beside = [math.ceil(BESIDE * n) for n in sags.values.shape]
     values = np.pad(sags.values, [(k, k) for k in beside], mode="reflect", reflect_type="odd")
     half = (0.5 * w * (1.0 + 2.0 * k / (n - 1)) for w, k, n in zip(sags.size, beside, sags.values.shape, strict=True))
-    return ScreenShape(*HeightField.through(values, tuple(half)))
+    return CurvedScreen(*HeightField.through(values, tuple(half)))
+
+
+def shape_of(screen: Screen) -> PlaneScreen:
+    """The shape of a screen."""
+    return _shape(tuple(screen.radius), screen.sags)
 
 
 def points_in_space(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of a screen in space, mm, from its own coordinates x, y, mm, measured from its centre."""
     shape, (ax, ay, n) = shape_of(screen), screen.axes
-    s = 0.0 if shape is None else shape.at(x, y)[0]
+    s = shape.at(x, y)[0]
     px, py, pz = (m + x * a + y * b + s * c for m, a, b, c in zip((*screen.shift, screen.z), ax, ay, n, strict=True))
     return px, py, pz
 
@@ -94,21 +114,20 @@ def points_in_space(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.nd
 def normals(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals in space, of length A, at points of a screen given by its own coordinates."""
     shape, (ax, ay, n) = shape_of(screen), screen.axes
-    sx, sy = (0.0 * x, 0.0 * y) if shape is None else shape.at(x, y)[1:]
+    sx, sy = shape.at(x, y)[1:]
     nx, ny, nz = (c - sx * a - sy * b for a, b, c in zip(ax, ay, n, strict=True))
     return nx, ny, nz
 
 
 def areas(screen: Screen) -> np.ndarray | None:
     """A of every pixel, (n_x, n_y); None for a plane screen, where it is 1."""
-    shape = shape_of(screen)
-    if shape is None:
+    if not screen.curved:
         return None
     x, y = (
         (np.arange(n)[:, None] + GAUSS).ravel() * w - h
         for n, w, h in zip(screen.resolution, screen.pixel, screen.half_size, strict=True)
     )
-    _, sx, sy = shape.at(x[:, None], y[None, :])
+    _, sx, sy = shape_of(screen).at(x[:, None], y[None, :])
     (n, m), k = screen.resolution, len(GAUSS)
     return np.sqrt(1.0 + sx * sx + sy * sy).reshape(n, k, m, k).mean((1, 3))
 

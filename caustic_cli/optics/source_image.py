@@ -84,17 +84,16 @@ def _matrices(scene: Scene, through: np.ndarray, onto: np.ndarray) -> np.ndarray
     lines = [through * h for h in lens.half_size]
     x, y = (c.ravel() for c in np.meshgrid(*lines, indexing="ij"))
     z = lens.offset.heights(*lines).ravel()
-    if lens.round:
-        inside = np.hypot(x, y) <= lens.half_size[0] * (1.0 + 1e-9)
-        x, y, z = x[inside], y[inside], z[inside]
+    inside = np.all([far <= r * (1.0 + 1e-9) for far, r in lens.opening.distances(x, y)], axis=0)
+    x, y, z = x[inside], y[inside], z[inside]
     u, v = (c.ravel() for c in np.meshgrid(*(onto * h for h in screen.half_size), indexing="ij"))
     exit, at = np.stack([x, y, z], -1)[:, None], np.stack(points_in_space(screen, u, v), -1)[None]
     upright = np.stack(normals(screen, u, v), -1)[None]
-    n = 1.0 if lens.mirror else lens.inside
+    n, interaction = lens.inside, lens.interaction
     chief, toward = _arriving(scene, exit, (0.0, 0.0)), at - exit
     toward = toward / np.linalg.norm(toward, axis=-1, keepdims=True)
     normal = n * chief - toward
-    reached = lens.mirror | ((chief * toward).sum(-1) * n > 1.0)
+    reached = interaction.reaches(n, (chief * toward).sum(-1))
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-300)
     step = STEP if scene.source.distant else STEP * abs(lens.z_in - scene.source.centre[2])
     along = np.stack(np.broadcast_arrays(*screen.axes[:2]), -1)
@@ -103,7 +102,7 @@ def _matrices(scene: Scene, through: np.ndarray, onto: np.ndarray) -> np.ndarray
         ends = []
         for sign in (1.0, -1.0):
             arriving = _arriving(scene, exit, (sign * step * (k == 0), sign * step * (k == 1)))
-            leaving, passed = _left(arriving, normal, n, lens.mirror)
+            leaving, passed = interaction.leaving(arriving, normal, n)
             reached = reached & passed
             cosine = (leaving * upright).sum(-1, keepdims=True)
             reached = reached & (np.abs(cosine[..., 0]) > STEP)
@@ -117,12 +116,12 @@ def _arriving(scene: Scene, exit: np.ndarray, moved: tuple[float, float]) -> np.
     """Unit directions (..., 3) in front of the exit at points (..., 3) of it, of light from a point of the source that is displaced
     by `moved` from its centre."""
     lens, source = scene.lens, scene.source
-    n = 1.0 if lens.mirror else lens.inside
+    n = lens.inside
     if source.distant:
         p, q = (m / n for m in moved)
         return np.array([p, q, math.sqrt(1.0 - p * p - q * q)]) + 0.0 * exit
     d = exit[..., :2] - np.array(source.centre[:2]) - np.array(moved)
-    entrance = exit[..., 2] if lens.mirror else np.full(exit.shape[:-1], lens.z_in)
+    entrance = lens.interaction.entered(lens.z_in, exit[..., 2])
     far, before, within = np.linalg.norm(d, axis=-1), entrance - source.centre[2], exit[..., 2] - entrance
     tangent = far / before  # of the angle in front of the entrance: before t + within t / sqrt(n^2 + (n^2 - 1) t^2) = far
     for _ in range(STEPS):
@@ -131,13 +130,3 @@ def _arriving(scene: Scene, exit: np.ndarray, moved: tuple[float, float]) -> np.
     part = tangent / (n * np.sqrt(1.0 + tangent**2) * np.maximum(far, 1e-300))  # sine in the glass over the distance
     d = d * part[..., None]
     return np.concatenate([d, np.sqrt(1.0 - (d * d).sum(-1, keepdims=True))], -1)
-
-
-def _left(direction: np.ndarray, normal: np.ndarray, n: float, mirror: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions behind the exit, and where there are any, beyond total reflection there are none."""
-    along = (direction * normal).sum(-1, keepdims=True)
-    if mirror:
-        return direction - 2.0 * along * normal, np.ones(along.shape[:-1], dtype=bool)
-    square = 1.0 - n * n * (1.0 - along * along)
-    side = np.where(along < 0, -1.0, 1.0)
-    return n * (direction - along * normal) + side * np.sqrt(np.maximum(square, 0.0)) * normal, square[..., 0] > 0

@@ -71,6 +71,13 @@ class Spread:
         cut = _cut(min((h for h in self.half if h > 0), default=max(self.reach()) / 2.0), pixel, most)
         return Convolution(torch.from_numpy(self.kernel((pixel[0] / cut, pixel[1] / cut))), cut)
 
+    def convolutions(self, pixel: tuple[float, float], places: list[tuple[float, float]]) -> list[Convolution]:
+        """The convolution `on` an image, or with each of the source's `parts_on` these places, if any are given; none for a point
+        source."""
+        if not max(self.reach()) > 0:
+            return []
+        return self.parts_on(pixel, places) if places else [self.on(pixel)]
+
     def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]], most: int = MOST_CUT) -> list[Convolution]:
         """Convolutions with parts of the source: the Voronoi cells of these points of its frame, [-1, 1]^2, each about its point.
 
@@ -122,6 +129,10 @@ class Spread:
                 weight = power[:, None] * light * np.abs(1 - p - (at_x - i)) * np.abs(1 - q - (at_y - j))
                 found += np.bincount(((i + p) * (2 * b + 2) + j + q).ravel(), weight.ravel(), len(found))
         return found.reshape(2 * a + 2, 2 * b + 2)[:-1, :-1]
+
+
+#: That of a point source.
+POINT = Spread((0.0, 0.0), ((0.0, 0.0, 1.0),), 0.0)
 
 
 def _bright(picture: np.ndarray, half: tuple[float, float], cell: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

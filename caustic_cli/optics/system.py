@@ -22,45 +22,15 @@ from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import AxisSegment, Pose
-from caustic_cli.optics.gradient.fields import IndexField, index_field_of
+from caustic_cli.optics.media import AIR, Medium, medium_of
 from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Sphere, Surface
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Aperture, Component, FreeForm, Lens, Light, Pupil, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES, surface_name
-from caustic_cli.scene.materials import refractive_index
 
 INTERACTIONS = ("refract", "reflect")
 #: Names of the elements of a one-lens scene.
 ENTRANCE, EXIT = "entrance", "exit"
-
-
-@dataclass(frozen=True)
-class Medium:
-    """A transparent medium.
-
-    Args:
-        index: refractive index; for a glass, that of rays without a wavelength.
-        absorption: absorption coefficient a, 1/mm; the transmittance of t mm is exp(-a t) (Beer-Lambert).
-        glass: a dispersive material, by its name in `materials`; None for `index` at every wavelength.
-        gradient: gradient-index field, in the frame of the element in front of the medium, scaled by the ratio of the glass' index
-            at a wavelength to `index`; None for a homogeneous medium.
-    """
-
-    index: float = 1.0
-    absorption: float = 0.0
-    glass: str | None = None
-    gradient: IndexField | None = None
-
-    def __post_init__(self):
-        checks.number("index", self.index, 1.0, 5.0)
-        checks.number("absorption", self.absorption, 0.0, 1e6)
-
-    def index_at(self, wavelength: float | None) -> float:
-        """Refractive index at a wavelength, nm."""
-        return self.index if self.glass is None or wavelength is None else refractive_index(self.glass, wavelength)
-
-
-AIR = Medium()
 
 
 @dataclass(frozen=True)
@@ -93,6 +63,11 @@ class Element:
     def reflects(self) -> bool:
         """Whether it is a mirror."""
         return self.interaction == "reflect"
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """Names of the effects on rays that it causes beside refraction or reflection."""
+        return frozenset({"roughness"} if self.roughness else ())
 
 
 def entrance_of(lens: Lens) -> Fixed:
@@ -152,11 +127,8 @@ def _elements_of(
             surface = Sphere(radius, component.reach) if math.isfinite(radius) else Plane()
         pose = leg.pose(component.vertex(side), component.tilt)
         name, opening = surface_name(number, side), component.opening
-        if component.mirror:
-            found.append(Element(name, surface, opening, "reflect", pose=pose))
-        else:
-            behind = glass if side == "front" else AIR
-            found.append(Element(name, surface, opening, behind=behind, pose=pose, fresnel=scene.lens.fresnel))
+        behind = glass if side == "front" else AIR
+        found.append(Element(name, surface, opening, component.interaction.name, behind, pose, scene.lens.fresnel))
     return found
 
 
@@ -194,8 +166,7 @@ class System:
     leg: AxisSegment | None = None
 
     def __post_init__(self):
-        if self.before.gradient is not None:
-            raise InputError("the medium in front of a system cannot have a gradient: no element defines its frame; add one")
+        self.before.check_first()
         if not self.elements or not self.sources:
             raise InputError("a system needs at least one source and one element")
         names = [e.name for e in self.elements]
@@ -214,29 +185,25 @@ class System:
         lens = scene.lens
         surface = surface or HeightField.of(lens)
         entrance = Plane() if not scene.two_sided else surface if lens.entrance is None else entrance_of(lens)
-        aperture = Aperture(lens.half_size, lens.round)
-        elements: tuple[Element, ...]
-        if lens.mirror:
-            elements = (Element(EXIT, surface, aperture, "reflect", roughness=lens.roughness),)
-        else:
-            elements = (
-                Element(
-                    ENTRANCE,
-                    entrance,
-                    aperture,
-                    behind=Medium(lens.index, lens.absorption, lens.glass, index_field_of(lens)),
-                    pose=Pose((0.0, 0.0, lens.z_in)),
-                    fresnel=lens.fresnel,
-                ),
-                Element(EXIT, surface, aperture, fresnel=lens.fresnel, roughness=lens.roughness),
+        elements: tuple[Element, ...] = (
+            Element(EXIT, surface, lens.opening, lens.interaction.name, fresnel=lens.fresnel, roughness=lens.roughness),
+        )
+        if not lens.mirror:
+            first = Element(
+                ENTRANCE,
+                entrance,
+                lens.opening,
+                behind=medium_of(lens),
+                pose=Pose((0.0, 0.0, lens.z_in)),
+                fresnel=lens.fresnel,
             )
+            elements = (first, *elements)
         lit, leg = None if scene.two_sided or scene.before else scene.pupil, AxisSegment()
-        if scene.elements:
-            first, number = elements, len(scene.before)
-            elements = tuple(e for k, c in enumerate(scene.before) for e in _elements_of(c, k, leg, scene, surface.spaces)) + first
-            for k, component in enumerate(scene.behind, number):
-                elements += tuple(_elements_of(component, k, leg, scene, surface.spaces))
-                leg = leg.folded(component.z, component.tilt) if component.mirror else leg
+        ahead = tuple(e for k, c in enumerate(scene.before) for e in _elements_of(c, k, leg, scene, surface.spaces))
+        elements = (*ahead, *elements)
+        for k, component in enumerate(scene.behind, len(scene.before)):
+            elements += tuple(_elements_of(component, k, leg, scene, surface.spaces))
+            leg = component.axis_behind(leg)
         return cls((scene.source,), elements, (scene.screen,), scene.light, lit=lit, leg=leg if leg != AxisSegment() else None)
 
     def placed(self, screen: Screen) -> PlacedScreen:
@@ -253,12 +220,18 @@ class System:
         if self.lit is not None:
             return self.lit
         first = self.elements[0]
-        return Pupil(first.aperture.half_size, first.pose.position[2], first.aperture.round)
+        return Pupil(first.aperture, first.pose.position[2])
 
     @property
     def free(self) -> dict[str, tuple[int, int]]:
         """Shapes of the heights of all free-form surfaces, by name."""
         return {e.name: e.surface.shape for e in self.elements if e.surface.shape is not None}
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """Names of the effects on rays (`optics.effects`) that its parts cause."""
+        parts: tuple[Medium | Element | Light, ...] = (*self.media(), *self.elements, self.light)
+        return frozenset[str]().union(*(part.effects for part in parts))
 
     def media(self) -> tuple[Medium, ...]:
         """The medium in front of each element, and behind the last."""

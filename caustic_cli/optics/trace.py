@@ -1,18 +1,18 @@
 """Sequential ray tracing from the sources to the screens (thesis 4.3.1).
 
     trace(system, rays, {surface name: heights}) = fold over the elements of
-        intersect -> before_interaction -> interact -> after_interaction
+        carry -> before_interaction -> interact -> after_interaction
     image = splat(land(trace(...)))
 
-    intersect            ray transfer to the element's surface, in its own frame
+    carry                ray transfer through the medium to the element's surface
     before_interaction   effects on the path and at the surface: absorption, roughness
     interact             refraction with Fresnel losses, or reflection by a mirror
     after_interaction    effects behind the surface
     stray light          non-sequential paths, traced afterwards: ghosts, secondary intersections
 
 Elements in front of the first free-form surface do not depend on heights and are traced once, when a `Tracer` is constructed.  The
-rest is *lowered* to one fused kernel where it is a single upright B-spline in front of an upright screen, without effects other
-than refraction and Fresnel losses (decided in `_lowered` alone).  Everything else uses the stages of the device's backend.
+rest is *lowered* to one fused kernel where there is one for it (decided in `lowering` alone).  Everything else uses the stages of
+the device's backend.  Media carry the rays from surface to surface (`media`).
 
 Powers are fractions of the sources' power.  Energy is conserved: image + every entry of `lost` = 1.
 """
@@ -30,21 +30,22 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.backends import Fused, backend_for
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Rays, of_member, rays_of
-from caustic_cli.optics.frames import IDENTITY, Pose, advance, rotate_to_global, rotate_to_local, to_global, to_local
-from caustic_cli.optics.gradient.fields import IndexField
-from caustic_cli.optics.gradient.transfer import index_at, transfer
+from caustic_cli.optics.frames import rotate_to_global, rotate_to_local
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.interaction import Interaction, Parameters
-from caustic_cli.optics.interface import interact
+from caustic_cli.optics.interface import OutgoingRays, interact
+from caustic_cli.optics.lowering import covers, lowered
 from caustic_cli.optics.memory import with_smaller_chunks
-from caustic_cli.optics.rays import LOSSES, RayState, Status
+from caustic_cli.optics.ray_transfer import prepared_intersection
+from caustic_cli.optics.rays import LOSSES, RayState, RayStatus
+from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
-from caustic_cli.optics.screen_shape import reach, shape_of
-from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
+from caustic_cli.optics.screen_shape import reach
+from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, Element, PlacedScreen, System
 from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
 
@@ -52,11 +53,6 @@ from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
 CHUNK = 1 << 19
 #: No parameters at all.
 NOTHING: Parameters = MappingProxyType({})
-
-
-def index_name(element: Element) -> str:
-    """Key in `Parameters` of the coefficients of the gradient-index field behind an element."""
-    return f"{element.name}.index"
 
 
 class Tracer:
@@ -88,16 +84,17 @@ class Tracer:
     ):
         self.system, self.requests, self.weight, self.channel, self.track = system, requests, weight, channel, track
         self.media, self.sides = system.media(), system.sides()
-        #: Numbers of integration steps by (medium, element, forward), and the parameters for which they were chosen.
+        #: Of gradient-index media: numbers of integration steps by (medium, element, forward), with the parameters they are for.
         self.steps: dict[tuple[int, int, bool], tuple[int, list]] = {} if like is None else dict(like.steps)
         pupil = system.pupil
         state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
         state = replace(state, lost=dict(state.lost), wavelength=wavelength)
         self.backend = backend_for(state.power.device)
         self.dtype = self.backend.precision(dtype)
-        for effect in EFFECTS:
+        acting = EFFECTS.acting(system, requests)
+        for effect in acting:
             state = effect.prepare(system, state, requests)
-        made = (effect.action(system, requests) for effect in EFFECTS)
+        made = (effect.action(system, requests) for effect in acting)
         #: Power through the pupil, () or, with colours, (3,).
         shape = state.power.shape if state.sample is None else state.sample.shape
         self.entering = self._of_color(weight * state.power.expand(shape).sum(dtype=torch.float64))
@@ -110,14 +107,14 @@ class Tracer:
             while (
                 self.first < len(system.elements)
                 and system.elements[self.first].surface.shape is None
-                and not any(medium.gradient for medium in self.media[self.first : self.first + 2])
+                and not any(medium.varies for medium in self.media[self.first : self.first + 2])
             ):
                 interaction = self.trace_element(self.first, state, None)
                 if self.recorded:
                     self.before.append(interaction)
                 state, self.first, self._behind = interaction.state, self.first + 1, interaction
         self.start = state
-        self.fused = None if requests.stages else self._lowered(like)
+        self.fused: Fused | None = lowered(self, None if like is None else like.fused)
 
     def __call__(self, parameters: Parameters) -> list[RayState]:
         """Heights {name: (n, m) mm float64} -> rays behind the last element: the direct light, then stray light."""
@@ -132,10 +129,20 @@ class Tracer:
                 states += action.stray_light(self, parameters, interactions)
         return states
 
+    def owner(self, medium: int) -> Element:
+        """The element in front of a medium, by its number."""
+        owner = self._owners[medium]
+        assert owner is not None
+        return self.system.elements[owner]
+
     @cached_property
-    def owners(self) -> tuple[int | None, ...]:
-        """See `System.owners`."""
+    def _owners(self) -> tuple[int | None, ...]:
         return self.system.owners()
+
+    @cached_property
+    def prepared_intersection(self):
+        """See `ray_transfer.prepared_intersection`."""
+        return prepared_intersection(self)
 
     def _interactions(self, parameters: Parameters) -> Iterator[Interaction]:
         """The sequential trace from the first free surface to the last element."""
@@ -154,15 +161,25 @@ class Tracer:
         """Rays at a lens' exit in its frame: slopes of the surface, directions in front of it, powers in front of it."""
         exit = next((m for m in self._interactions(parameters) if m.element.name == EXIT), None) or self.last(parameters)
         assert exit.power_in is not None
-        return exit.slopes, exit.incoming, exit.power_in
+        return exit.hit.slopes, exit.hit.incoming, exit.power_in
 
     def land(self, parameters: Parameters, screen: Screen | PlacedScreen) -> list[RayState]:
         """Rays on a screen: x and y of their origins are the screen's coordinates, mm."""
         return [self.onto(state, screen) for state in self(parameters)]
 
+    def onto(self, state: RayState, screen: Screen | PlacedScreen) -> RayState:
+        """Ray transfer to a screen; x and y of the origins are then the screen's coordinates, mm."""
+        return self._land(state, Receiver.of(self.system, screen))
+
+    def _land(self, state: RayState, receiver: Receiver) -> RayState:
+        ray, arrives = receiver.land(self.backend, state)
+        if self.track:
+            ray.mark(~arrives, RayStatus.AWAY_FROM_SCREEN)
+        return ray
+
     def expose(self, parameters: Parameters, screen: Screen | PlacedScreen, filter: Filter) -> Image[Tensor]:
         """Heights {name: (n, m) mm float64} -> image and energy balance on a screen."""
-        if self.fused is not None and isinstance(screen, Screen) and screen.upright:
+        if self.fused is not None and covers(screen):
             image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
             for name, value in self.start.lost.items():
                 lost[name] = lost.get(name, 0.0) + value
@@ -174,10 +191,10 @@ class Tracer:
         image: Tensor | float = 0.0
         leaving: Tensor | float = 0.0
         lost: dict[str, Tensor | float] = {}
+        receiver = Receiver.of(self.system, screen)
         for state in states:
-            ray = self.onto(state, screen)
-            frame = screen if isinstance(screen, Screen) else screen.screen
-            part, off = self.backend.splat(*ray.origin[:2], ray.power, frame, filter)
+            ray = self._land(state, receiver)
+            part, off = self.backend.splat(*ray.origin[:2], ray.power, receiver.screen, filter)
             assert ray.leaving is not None
             image, leaving = image + part, leaving + ray.leaving
             ray.book("off_screen", off)
@@ -217,137 +234,30 @@ class Tracer:
             direct: whether this is the nominal path, or stray light.
             parameters: those of gradient-index media, see `index_name`; a medium's own where they are missing.
         """
-        element = self.system.elements[k]
-        n = [medium.index_at(state.wavelength) for medium in self.media[k : k + 2]]
-        n_in, n_out = n if forward else n[::-1]
-        side = self.sides[k] if forward else -self.sides[k]
-        m = Interaction(
-            weakref.proxy(self),  # which refers to the last interaction: a reference cycle would delay the release of its arrays
-            k,
-            element,
-            forward,
-            side,
-            n_in,
-            n_out,
-            direct,
-            state,
-        )
-        self._meet(m, heights, parameters)
+        below, above = (medium.index_at(state.wavelength) for medium in self.media[k : k + 2])
+        proxy = weakref.proxy(self)  # it refers to the last interaction: a reference cycle would delay the release of its arrays
+        m = Interaction(proxy, k, forward, direct, state, *((below, above) if forward else (above, below)))
+        self.media[m.ahead].carry(self, m, heights, parameters)
+        self.media[m.beyond].receive(self, m, parameters)
         for action in self.actions:
             action.before_interaction(m)
         m.power_in = m.state.power
-        m.power_out = m.state.power = self._interact(m)
+        m.out = self._interact(m)
+        m.state.power = m.out.power
         for action in self.actions:
             action.after_interaction(m)
         return m
 
-    def _meet(self, m: Interaction, heights: Tensor | None, parameters: Parameters) -> None:
-        """Ray transfer to the surface of an interaction's element."""
-        element = m.element
-        ahead, behind = (m.index, m.index + 1) if m.forward else (m.index + 1, m.index)
-        if self.media[ahead].gradient is not None:
-            self._intersect_through_gradient(m, ahead, heights, parameters)
-            self._set_index_behind(m, behind, parameters)
-            return
-        prepared = self.prepared_intersection if m.state is getattr(self, "start", None) else None  # valid for these rays only
-        state = replace(m.state, lost=dict(m.state.lost))
-        if m.index == self.first and m.forward and heights is not None:
-            state = state.counted_from(element.pose.position[2] + element.surface.centred(heights)[1])
-        if self._at_pupil(m):
-            state = state if self.media[behind].gradient is None else state.expanded()
-            o, d = to_local(element.pose, state.origin, state.direction, state.datum)
-            m.state, m.local, m.incoming, m.slopes = state, o, d, (0.0, 0.0)
-            self._set_index_behind(m, behind, parameters)
-            return
-        state = state.expanded()
-        o, d = to_local(element.pose, state.origin, state.direction, state.datum)
-        if m.index == 0 and m.forward and prepared is None and self.system.lit is None and not element.surface.flat:
-            o, state = self._moved_before_surface(o, d, state, element, heights)
-        hit = next((h for a in self.actions if (h := a.intersect(m, o, d, heights)) is not None), None)
-        if hit is None:
-            hit = prepared(heights) if prepared else element.surface.intersect(heights, o, d, m.side)
-        if state.power.dtype != self.dtype:  # the first intersection is always computed in float64
-            t, gx, gy = (_cast(c, self.dtype) for c in hit[:3])
-            state, hit = state.to(self.dtype), SurfaceIntersection(t, gx, gy, hit.found)
-            o, d = (tuple(_cast(c, self.dtype) for c in v) for v in (o, d))
-        m.local, m.incoming, m.slopes, m.length = advance(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
-        aperture, pupil = element.aperture, self.system.pupil
-        within = (aperture.half_size, aperture.round) == (pupil.half_size, pupil.round)
-        if prepared is None or state.sample is None or not within:  # a sample of the same aperture lies on the surface
-            found = hit.found
-            if aperture.round or aperture.half_size != element.surface.half_size:
-                found = found & aperture.contains(*m.local[:2])
-            kept = torch.where(found, state.power, torch.zeros_like(state.power))
-            state.lose("missed_surface", (state.power - kept).detach())
-            if self.track:
-                state.mark(~found, Status.MISSED_SURFACE)
-            state.power = kept
-        state.origin = to_global(element.pose, m.local, state.datum)
-        state.path = state.path + m.n_in * hit.t
-        m.state = state
-        self._set_index_behind(m, behind, parameters)
-
-    def _intersect_through_gradient(self, m: Interaction, medium: int, heights: Tensor | None, parameters: Parameters) -> None:
-        """Ray transfer through a gradient-index medium to the surface (`gradient.transfer`)."""
-        element, state = m.element, replace(m.state, lost=dict(m.state.lost)).expanded()
-        name, pose, field, scale = self._medium(medium, state.wavelength)
-        point, direction = (
-            tuple(c.double() for c in state.full(v)) for v in to_local(pose, state.origin, state.direction, state.datum)
-        )
-
-        def seen(points, vectors):
-            o, d = to_global(pose, points, state.datum), rotate_to_global(pose, vectors)
-            return to_local(element.pose, o, d, state.datum)
-
-        way, given = (medium, m.index, m.forward), [None if c is None else c.detach() for c in (parameters.get(name), heights)]
-        steps, before = self.steps.get(way, (None, given))
-        if not all(a is b or (a is not None and b is not None and torch.equal(a, b)) for a, b in zip(given, before, strict=True)):
-            steps = None  # the number for other parameters may be too small
-        found = transfer(
-            self.backend.flow,
-            field,
-            parameters.get(name),
-            point,
-            direction,
-            element.surface,
-            heights,
-            seen,
-            m.side,
-            steps,
-        )
-        if steps is None:
-            self.steps[way] = found.steps, [None if c is None else c.clone() for c in given]
-        m.local, m.incoming = seen(found.point, found.direction)
-        m.slopes, m.length, m.n_in = found.slopes, found.length, scale * found.n
-        met = found.found & element.aperture.contains(*m.local[:2])
-        kept = torch.where(met, state.power, torch.zeros_like(state.power))
+    def keep(self, state: RayState, found: Tensor) -> None:
+        """Keep the rays that are `found` to meet a surface, and count the power of the others as lost."""
+        kept = torch.where(found, state.power, torch.zeros_like(state.power))
         state.lose("missed_surface", (state.power - kept).detach())
         if self.track:
-            state.mark(~met, Status.MISSED_SURFACE)
-        state.power, state.sample = kept, None
-        state.origin = to_global(element.pose, m.local, state.datum)
-        state.path = state.path + scale * found.path
-        m.state = state
+            state.mark(~found, RayStatus.MISSED_SURFACE)
+        state.power = kept
 
-    def _set_index_behind(self, m: Interaction, medium: int, parameters: Parameters) -> None:
-        """Set the index behind the surface where the medium has a gradient."""
-        if self.media[medium].gradient is None or m.reflects:
-            return
-        state = m.state
-        name, pose, field, scale = self._medium(medium, state.wavelength)
-        point = to_local(pose, tuple(c.double() for c in state.full(state.origin)), (0.0, 0.0, 1.0), state.datum)[0]
-        m.incoming = state.full(m.incoming)
-        m.n_out = scale * index_at(self.backend.flow, field, parameters.get(name), point)
-
-    def _medium(self, medium: int, wavelength: float | None) -> tuple[str, Pose, IndexField, float]:
-        """Of a gradient-index medium: key of its coefficients, frame, field, and scale factor of the index at this wavelength."""
-        owner, is_of = self.owners[medium], self.media[medium]
-        assert owner is not None and is_of.gradient is not None
-        element = self.system.elements[owner]
-        return index_name(element), element.pose, is_of.gradient, is_of.index_at(wavelength) / is_of.index
-
-    def _interact(self, m: Interaction) -> Tensor:
-        """Refract or reflect the rays; returns the power behind the surface."""
+    def _interact(self, m: Interaction) -> OutgoingRays:
+        """Refract or reflect the rays."""
         state, element, power_in = m.state, m.element, m.power_in
         assert power_in is not None
         polarised = None
@@ -355,8 +265,8 @@ class Tracer:
             polarised = rotate_to_local(element.pose, state.polarised)
         eta = m.n_in / m.n_out
         found = (self.backend.interact if isinstance(eta, float) else interact)(
-            m.incoming,
-            m.slopes,
+            m.hit.incoming,
+            m.hit.slopes,
             power_in,
             eta=eta,
             reflects=m.reflects,
@@ -364,7 +274,6 @@ class Tracer:
             polarised=polarised,
             side=m.side,
         )
-        m.passes = found.passes
         state.direction = rotate_to_global(element.pose, found.direction)
         if not m.reflects:
             with torch.no_grad():
@@ -376,132 +285,16 @@ class Tracer:
                     state.lose("fresnel", gone - totally)
                     state.lose("total_internal_reflection", totally)
             if self.track:
-                state.mark(~found.passes & (power_in > 0), Status.TOTAL_INTERNAL_REFLECTION)
-        if not any(isinstance(c, Tensor) for c in state.direction) and state.direction == (0.0, 0.0, 1.0):
-            return found.power
-        state.sample = None
-        return found.power
-
-    def _at_pupil(self, m: Interaction) -> bool:
-        """Whether the rays lie on this plane first element already, without any that miss it, as their source emits them."""
-        e, pupil, z = m.element, self.system.pupil, m.state.origin[2]
-        if m.index or not m.forward or not isinstance(z, float) or z + m.state.datum != pupil.z:
-            return False
-        return (
-            e.surface.flat
-            and e.pose.upright
-            and e.pose.position == (0.0, 0.0, pupil.z)
-            and (e.aperture.half_size, e.aperture.round) == (pupil.half_size, pupil.round)
-        )
-
-    def _moved_before_surface(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
-        """Rays on a pupil that intersects the first surface, moved back in front of it."""
-        low = element.surface.hull(heights)[0]
-        back = max(0.0, float(torch.as_tensor(o[2], dtype=torch.float64).max()) - low)
-        if back == 0.0:
-            return o, state
-        way = -back * (1.0 + 1e-9) / d[2]
-        moved = (torch.as_tensor(c + way * v, dtype=torch.float64) for c, v in zip(o, d, strict=True))
-        path = state.path + self.media[0].index_at(state.wavelength) * way
-        return tuple(c.expand(state.power.shape) for c in moved), replace(state, path=path)
-
-    @cached_property
-    def prepared_intersection(self):
-        """Intersections of the rays `start` with the first free surface as a prepared function of its heights; None if that case is
-        not covered."""
-        if self.first == len(self.system.elements) or self.requests.off & {"intersection"}:
-            return None
-        element, start = self.system.elements[self.first], self.start
-        surface, pupil = element.surface, self.system.pupil
-        if not isinstance(surface, HeightField) or self.sides[self.first] < 0 or not element.pose.upright:
-            return None
-        if self.first == 0 and self.system.lit is None and start.sample is None:
-            return None
-        px, py, pz = element.pose.position
-        centred = (px, py) == (0.0, 0.0)
-        on_axis = start.sample is not None and start.direction == (0.0, 0.0, 1.0)
-        if on_axis and centred and surface.half_size == pupil.half_size:
-            evaluate = self.backend.spline_on(surface, start.sample, self.dtype)
-
-            def sampled(heights: Tensor) -> SurfaceIntersection:
-                sag, gx, gy = evaluate(surface.centred(heights)[0])
-                below = start.origin[2] - pz - float(heights.detach().double().mean()) - start.datum
-                found = torch.ones((), dtype=torch.bool, device=sag.device).expand(sag.shape)
-                return SurfaceIntersection(sag - below, gx, gy, found)
-
-            return sampled
-        spread = start.expanded()
-        full = spread.full((*spread.origin, *spread.direction))
-        origin = (full[0] - px, full[1] - py, full[2] + (start.datum - pz))
-        return self.backend.intersect_fixed(surface, origin, full[3:])
-
-    def _lowered(self, like: Tracer | None):
-        """The rest of the system as one fused kernel, a function of heights, screen and filter; None where it does not apply."""
-        if any(medium.gradient for medium in self.media):
-            return None
-        if self.first != len(self.system.elements) - 1 or self.actions or self.track or self.start.polarised is not None:
-            return None
-        element = self.system.elements[-1]
-        surface, start, m = element.surface, self.start, self.media
-        plain = (
-            isinstance(surface, HeightField)
-            and not element.reflects
-            and element.pose == Pose()
-            and self.sides[-1] > 0
-            and element.aperture.half_size == surface.half_size
-            and isinstance(start.origin[2], float)
-            and self.system.pupil.half_size == surface.half_size
-            and (self.system.lit is not None or self.first > 0)
-        )
-        if not plain:
-            return None
-        eta = m[-2].index_at(start.wavelength) / m[-1].index_at(start.wavelength)
-        if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface
-            return None
-        if start.along_axis and element.aperture.round != self.system.pupil.round:
-            return None
-        before = None if like is None else like.fused
-        if start.along_axis:
-            return self.backend.plane_image(surface, start, eta, element.fresnel, before)
-        return self.backend.ray_image(surface, start, eta, element.fresnel, element.aperture.radius, before)
-
-    def onto(self, state: RayState, screen: Screen | PlacedScreen) -> RayState:
-        """Ray transfer to a screen; x and y of the origins are then the screen's coordinates, mm."""
-        state = state.expanded()
-        if isinstance(screen, Screen) and self.system.leg is not None:
-            screen = self.system.placed(screen)
-        frame = screen if isinstance(screen, Screen) else screen.screen
-        (sx, sy), shape = frame.shift, shape_of(frame)
-        if isinstance(screen, PlacedScreen):
-            axes, middle = screen.pose.axes, screen.pose.position
-            if shape is not None:  # defined relative to the screen's centre
-                px, py, pz = (m + sx * a + sy * b for m, a, b in zip(middle, *axes[:2], strict=True))
-                middle = (px, py, pz)
-        else:
-            axes = IDENTITY if screen.upright else screen.axes
-            middle = (0.0, 0.0, screen.z) if screen.upright else (sx, sy, screen.z)
-        point = (middle[0], middle[1], middle[2] - state.datum)
-        along = sum(a * b for a, b in zip(self.system.axis, axes[2], strict=True))
-        land = self.backend.land if shape is None else shape.land
-        x, y, on_way = land(state.origin, state.direction, point, axes, 1.0 if along >= 0 else -1.0)
-        if shape is not None or (isinstance(screen, Screen) and not screen.upright):
-            x, y = x + sx, y + sy
-        weight = torch.where(on_way, state.power, torch.zeros_like(state.power))
-        out = replace(state, origin=(x, y, 0.0), power=weight, lost=dict(state.lost), leaving=state.power.sum(dtype=torch.float64))
-        out.lose("off_screen", (state.power - weight).detach())
-        if self.track:
-            out.mark(~on_way, Status.AWAY_FROM_SCREEN)
-        return out
-
-
-def _cast(value, dtype: torch.dtype):
-    return value.to(dtype) if isinstance(value, Tensor) else value
+                state.mark(~found.passes & (power_in > 0), RayStatus.TOTAL_INTERNAL_REFLECTION)
+        if any(isinstance(c, Tensor) for c in state.direction) or state.direction != (0.0, 0.0, 1.0):
+            state.sample = None
+        return found
 
 
 def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUESTS) -> bool:
     """Whether a scene is traced by a fused kernel."""
     few = next(iter(rays_of(scene, "grid", 4).chunks()))
-    return scene.screen.upright and Tracer(System.of(scene, field), few, requests=requests).fused is not None
+    return covers(scene.screen) and Tracer(System.of(scene, field), few, requests=requests).fused is not None
 
 
 def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = False) -> None:
@@ -572,7 +365,7 @@ def expose(
     screen, filter = screen or scene.screen, filter or Filter()
     heights = heights.detach().to(sampler.device, torch.float64)
     check_clearance(scene, heights, screen)
-    shape = (3, *screen.resolution) if scene.colored else screen.resolution
+    shape = (*scene.light.planes, *screen.resolution)
 
     def traced_by(size: int) -> Image[float]:
         parts = tracers(scene, field, sampler, dtype, size, requests)
@@ -666,16 +459,12 @@ def check_clearance(scene: Scene, heights: Tensor, screen: Screen) -> None:
     Raises:
         InputError: giving the extreme height of the surface.
     """
-    before, behind = reach(screen)
-    nearer = behind if scene.lens.mirror else -before
+    lens, side = scene.lens, scene.lens.interaction.side
+    nearer = max(-side * bound for bound in reach(screen))
     lean = f" and its {'shape' if screen.curved else 'tilt'} takes it {nearer:.4g} mm nearer" if nearer else ""
-    if scene.lens.mirror:
-        if float(heights.min()) <= screen.z + nearer:
-            raise InputError(
-                f"⟨screen.z⟩ must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
-                f" got {screen.z:g} mm{lean}"
-            )
-    elif float(heights.max()) >= screen.z - nearer:
+    top = side * float((side * heights).max())
+    if side * (screen.z - top) <= nearer:
         raise InputError(
-            f"⟨screen.z⟩ must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm, got {screen.z:g} mm{lean}"
+            f"⟨screen.z⟩ must lie {lens.interaction.beyond} the {lens.kind}, whose surface reaches {top:.6g} mm,"
+            f" got {screen.z:g} mm{lean}"
         )

@@ -1,19 +1,25 @@
-"""Files referenced by [source], [lens], [screen] and [design]: read once, validated, and copied into the project under fixed
-names."""
+"""Files that settings name: each is read once, validated, and copied into the project under a fixed name.
+
+A row of the table with a `file` is such a setting, and READERS reads its file.  The names in a configuration are relative to its
+directory (`located`); those of the command line are paths.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from caustic_cli.config import settings, tolerances
+from caustic_cli.config.settings import Given, Settings
+from caustic_cli.config.table import TABLE, Section, Setting
 from caustic_cli.io.arrays import open_npy
 from caustic_cli.io.files import read_bytes
-from caustic_cli.io.intensities import MOST_BYTES, TABLE, parse_distribution
+from caustic_cli.io.intensities import MOST_BYTES, parse_distribution
+from caustic_cli.io.intensities import TABLE as OF_INTENSITIES
 from caustic_cli.io.picture import read_picture
 from caustic_cli.io.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays
 from caustic_cli.io.sags import read_sags
@@ -21,37 +27,78 @@ from caustic_cli.scene.gradient import MOST_VALUES, checked_volume
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.section import Attached
 
-#: Name in a project of the file of [design] robust.
-ERRORS = "tolerances.toml"
-#: Name in a project, without suffix, of the file of [screen] shape_file.
-SHAPE = "screen"
+#: Settings that name a file.
+ROWS = [row for row in TABLE.values() if row.file]
+#: Beginnings of the names of all these files in a project.
+STEMS = tuple(row.file for row in ROWS)
 #: Name in a project of the file of [lens] index_file, and its largest size, bytes.
 INDEX, MOST_INDEX = "index.npy", 8 * MOST_VALUES + (1 << 12)
-#: Keys of [source] that may name a file, and its name in a project without suffix.
-STEMS = {"file": "source", "intensity": "intensity"}
-#: Beginnings of the names of all of them.
-ALL = (*STEMS.values(), SHAPE, Path(INDEX).stem, Path(ERRORS).stem)
+
+Sections = TypeVar("Sections", bound=Section)
 
 
-def attached(source: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """A [source] section in which file names carry the contents of the files (`Attached`).
+class _Located(str):
+    """A file name in a configuration, with the path of the file."""
 
-    Args:
-        folder: the directory of the files; None if names are paths given by the user.
+    path: Path
+
+
+class _Read(NamedTuple):
+    """The bytes of a file, the object read from them, and the suffix of its name in a project."""
+
+    data: bytes
+    content: Any
+    suffix: str
+
+
+def located(given: Given, folder: Path) -> Given:
+    """Settings in which the names of files know their path, relative to `folder`."""
+
+    def at(_row: Setting, name: str) -> str:
+        found = _Located(name)
+        found.path = folder / name
+        return found
+
+    return _changed(given, at)
+
+
+def attached(given: Given) -> Given:
+    """Settings in which the names of files carry their contents (`Attached`).
 
     Raises:
-        InputError: a file is missing, too large, or not of the kind of its key.
+        InputError: a file is missing, too large, or not of the kind of its setting.
     """
-    found = dict(source)
-    for key in STEMS:
-        name = source.get(key)
-        if isinstance(name, str) and not isinstance(name, Attached) and _is_file(key, name):
-            found[key] = _read(key, name if folder is None else str(folder / name))
-            if folder is not None:
-                found[key] = found[key].named(name)
-    if "also" in source:
-        found["also"] = [attached(table, folder) for table in source["also"]]
+
+    def read(row: Setting, name: str) -> str:
+        found = READERS[row.path](getattr(name, "path", Path(name)), given)
+        return Attached.of(name, found.data, found.content, found.suffix)
+
+    return _changed(given, read)
+
+
+def _changed(given: Given, change: Callable[[Setting, str], str]) -> Given:
+    """Settings in which every name of a file that is not read yet is changed."""
+    found = {section: dict(table) for section, table in given.items()}
+    if "also" in (source := found.get("source", {})):
+        source["also"] = [dict(table) for table in source["also"]]
+    for table, row in names_in(found):
+        if not isinstance(table[row.key], Attached):
+            table[row.key] = change(row, table[row.key])
     return found
+
+
+def names_in(given: Given) -> Iterator[tuple[dict[str, Any], Setting]]:
+    """The tables of settings with a name of a file, and its row."""
+    for row in ROWS:
+        first = given.get(row.section, {})
+        for table in (first, *first.get("also", ())):
+            if _is_file(row, table.get(row.key)):
+                yield table, row
+
+
+def _is_file(row: Setting, value: Any) -> bool:
+    """Whether a value names a file: one that may be a word, such as the default, does so by a suffix."""
+    return isinstance(value, str) and value != "" and (not row.default or bool(Path(value).suffix))
 
 
 def rays_of(name: str) -> RaySet:
@@ -63,47 +110,61 @@ def rays_of(name: str) -> RaySet:
     return parse_rays(read_bytes(Path(name), MAX_BYTES, ACCEPTED), name)
 
 
-def with_errors(design: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """A [design] section whose `robust` carries the contents of its file, if it names one; folder: as in `attached`.
-
-    Raises:
-        InputError: the file is missing, too large, or invalid.
-    """
-    name = design.get("robust")
-    if not name or not isinstance(name, str) or isinstance(name, Attached):
-        return dict(design)
-    path = Path(name) if folder is None else folder / name
-    data = read_bytes(path, settings.MAX_BYTES, settings.ACCEPTED)
-    return {**design, "robust": Attached.of(name, data, tolerances.read(path))}
+def _light(path: Path, _given: Given) -> _Read:
+    """A ray file, or the picture of a disc's brightness as irradiance."""
+    suffix = path.suffix.lower()
+    if suffix in SUFFIXES:
+        data = read_bytes(path, MAX_BYTES, ACCEPTED)
+        return _Read(data, parse_rays(data, str(path)), suffix)
+    light = read_picture(path, linear=True).irradiance()
+    return _Read(read_bytes(path, MAX_BYTES, ACCEPTED), light, suffix)
 
 
-def with_shape(screen: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """A [screen] section whose `shape_file` carries the heights of its file, if it names one; folder: as in `attached`.
-
-    Raises:
-        InputError: the file is missing or holds no heights.
-    """
-    name = screen.get("shape_file")
-    if name is None or isinstance(name, Attached):
-        return dict(screen)
-    data, heights = read_sags(Path(name) if folder is None else folder / name)
-    return {**screen, "shape_file": Attached.of(name, data, heights)}
+def _intensity(path: Path, _given: Given) -> _Read:
+    data = read_bytes(path, MOST_BYTES, OF_INTENSITIES)
+    return _Read(data, parse_distribution(data, str(path)), path.suffix.lower())
 
 
-def with_index(lens: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """A [lens] section whose `index_file` carries the control values of its file, if it names one; folder: as in `attached`.
+def _profile(path: Path, _given: Given) -> _Read:
+    picture = read_picture(path, linear=True)
+    return _Read(picture.encoded(), picture.irradiance(), picture.suffix)
 
-    Raises:
-        InputError: the file is missing, too large, or holds no volume of refractive indices.
-    """
-    name = lens.get("index_file")
-    if not isinstance(name, str) or isinstance(name, Attached):
-        return dict(lens)
-    path = Path(name) if folder is None else folder / name
+
+def _second(path: Path, given: Given) -> _Read:
+    """A second picture, encoded and inverted like the first."""
+    linear = given.get("target", {}).get("encoding") == "linear"
+    picture = read_picture(path, linear, invert=given.get("", {}).get("invert", False))
+    return _Read(picture.encoded(), picture.irradiance(), picture.suffix)
+
+
+def _index(path: Path, _given: Given) -> _Read:
+    """Control values (n, m, k) of refractive index."""
     accepted = "a .npy array of (n, m) or (n, m, k) refractive indices is needed"
     with open_npy(path, accepted) as stored:
         values = checked_volume(stored.read_reals(), "the array")
-    return {**lens, "index_file": Attached.of(name, read_bytes(path, MOST_INDEX, accepted), values)}
+    return _Read(read_bytes(path, MOST_INDEX, accepted), values, ".npy")
+
+
+def _sags(path: Path, _given: Given) -> _Read:
+    data, heights = read_sags(path)
+    return _Read(data, heights, path.suffix.lower())
+
+
+def _errors(path: Path, _given: Given) -> _Read:
+    data = read_bytes(path, settings.MAX_BYTES, settings.ACCEPTED)
+    return _Read(data, tolerances.read(path), ".toml")
+
+
+#: Reads the file of a setting, by its path, among all settings given.
+READERS: dict[str, Callable[[Path, Given], _Read]] = {
+    "source.profile": _profile,
+    "source.file": _light,
+    "source.intensity": _intensity,
+    "lens.index_file": _index,
+    "screen.shape_file": _sags,
+    "second.file": _second,
+    "design.robust": _errors,
+}
 
 
 def index_attached(values: np.ndarray) -> Attached:
@@ -118,42 +179,26 @@ def index_of(lens: Mapping[str, Any]) -> np.ndarray | None:
     return getattr(lens.get("index_file"), "content", None)
 
 
-def named_in_project(full: Mapping[str, dict[str, Any]]) -> None:
-    """Rename the files of complete settings to their names in a project, those of further sources with a number."""
-    source, lens, screen, design = (full[section] for section in ("source", "lens", "screen", "design"))
-    if isinstance(shape := screen.get("shape_file"), Attached):
-        screen["shape_file"] = shape.named(f"{SHAPE}{Path(shape).suffix.lower()}")
-    if isinstance(lens.get("index_file"), Attached):
-        lens["index_file"] = lens["index_file"].named(INDEX)
-    if isinstance(design.get("robust"), Attached):
-        design["robust"] = design["robust"].named(ERRORS)
-    for k, table in enumerate((source, *source.get("also", ()))):
-        for key, stem in STEMS.items():
-            if isinstance(table.get(key), Attached):
-                table[key] = table[key].named(f"{stem}{f'-{k + 1}' if k else ''}{Path(table[key]).suffix.lower()}")
+def named_in_project(full: Settings) -> Settings:
+    """Settings with the names of files in a project, those of further sources with a number."""
+
+    def named(section: Sections, number: str = "") -> Sections:
+        files = {row.key: (row.file, section[row.key]) for row in ROWS if isinstance(_value(section, row), Attached)}
+        return section.changed(**{key: file.named(f"{stem}{number}{file.suffix}") for key, (stem, file) in files.items()})
+
+    source = named(full.source)
+    if source.also:
+        source = source.changed(also=[named(table, f"-{k}") for k, table in enumerate(source.also, 2)])
+    second = None if full.second is None else named(full.second)
+    return full.changed(source=source, lens=named(full.lens), screen=named(full.screen), second=second, design=named(full.design))
 
 
-def of(full: Mapping[str, Mapping[str, Any]]) -> list[Attached]:
+def of(full: Settings) -> list[Attached]:
     """All files referenced by complete settings."""
-    source = full["source"]
-    others = full["design"].get("robust"), full["screen"].get("shape_file"), full["lens"].get("index_file")
-    return [file for file in others if isinstance(file, Attached)] + [
-        value for table in (source, *source.get("also", ())) for key in STEMS if isinstance(value := table.get(key), Attached)
-    ]
+    sections = (full.source, *full.source.also, full.lens, full.screen, full.design, *filter(None, [full.second]))
+    return [value for section in sections for row in ROWS if isinstance(value := _value(section, row), Attached)]
 
 
-def _is_file(key: str, name: str) -> bool:
-    """Whether the value of a key is a file name: an intensity may also be a keyword, which has no suffix."""
-    return bool(name) and (key != "intensity" or bool(Path(name).suffix))
-
-
-def _read(key: str, name: str) -> Attached:
-    path = Path(name)
-    if key == "intensity":
-        data = read_bytes(path, MOST_BYTES, TABLE)
-        return Attached.of(name, data, parse_distribution(data, name))
-    if path.suffix.lower() in SUFFIXES:
-        data = read_bytes(path, MAX_BYTES, ACCEPTED)
-        return Attached.of(name, data, parse_rays(data, name))
-    light = read_picture(path, linear=True).irradiance()
-    return Attached.of(name, read_bytes(path, MAX_BYTES, ACCEPTED), light)
+def _value(section: Section, row: Setting) -> Any:
+    """The value of a row in a section, None if it belongs to another."""
+    return section.get(row.key) if row.section == section.section else None

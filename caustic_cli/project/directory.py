@@ -25,8 +25,8 @@ try:
 except ImportError:  # not on Windows, where concurrent designs in one directory are not detected
     fcntl = None
 
-#: Names, without suffix, of the pictures of a project.
-PICTURES = ("target", "profile", "second")
+#: Name, without suffix, of the picture of a project.
+PICTURE = "target"
 
 
 def check(path: Path, force: bool) -> None:
@@ -55,10 +55,10 @@ def check(path: Path, force: bool) -> None:
 def _of_a_new_project(path: Path) -> bool:
     """Whether a file belongs to an incomplete project, whose design was killed before its project.toml was written."""
     return path.is_file() and (
-        path.name.startswith(tuple(f".{stem}" for stem in (*PICTURES, *attachments.ALL, TOML, uptodate.RECORD)))
+        path.name.startswith(tuple(f".{stem}" for stem in (PICTURE, *attachments.STEMS, TOML, uptodate.RECORD)))
         or uptodate.is_record(path)
-        or (path.stem in PICTURES and is_ours(path))
-        or (path.stem.split("-")[0] in attachments.ALL and any(map(is_ours, path.parent.glob("target.*"))))
+        or (path.stem == PICTURE and is_ours(path))
+        or (path.stem.split("-")[0] in attachments.STEMS and any(map(is_ours, path.parent.glob(f"{PICTURE}.*"))))
     )
 
 

@@ -18,7 +18,8 @@ from torch import Tensor
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete, complete_source
 from caustic_cli.config.design import build_options, build_stages
-from caustic_cli.config.settings import Settings, value_of
+from caustic_cli.config.settings import Settings
+from caustic_cli.config.table import SourceSettings, TargetSettings
 from caustic_cli.errors import InputError, no_project, plain
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.scene_parameters import Ranges
@@ -27,11 +28,13 @@ from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.kinds import problem_of
 from caustic_cli.optics.bounds import check_exit_above_entrance
+from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, checkpoint
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.scene import Scene, sources
+from caustic_cli.scene.sources.section import content
 
 TOML, CHECKPOINT, RENDER, WAVE, REPORT = "project.toml", "checkpoints.h5", "render.png", "wave.png", "report.png"
 #: Name of the image on the second screen, of a design with one.
@@ -50,6 +53,22 @@ def beside(path: Path) -> Path:
     return path.with_stem(Path(WAVE).stem if path.stem == Path(RENDER).stem else f"{path.stem}-wave")
 
 
+class LensData(NamedTuple):
+    """A lens of a project or an archive in its scene.
+
+    field, heights: spline spaces of its exit, and control heights (n, m), mm; target: (n_x, n_y) or (3, n_x, n_y) on the screen,
+    None for an archive; figures: of the evaluation of its design; state, provenance: of that, None for an archive.
+    """
+
+    scene: Scene
+    field: HeightField
+    heights: Tensor
+    target: np.ndarray | None = None
+    figures: Mapping[str, Any] = {}
+    state: State | None = None
+    provenance: dict[str, Any] | None = None
+
+
 class Designed(NamedTuple):
     """A designed lens: its scene, the spline spaces and heights (n, m) mm of its exit, and the checkpoint it comes from."""
 
@@ -61,9 +80,9 @@ class Designed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Project:
-    """An opened project: its directory, complete settings, target picture and source profile.
+    """An opened project: its directory, complete settings, and target picture.
 
-    path: None for a project in memory; second: the picture on a screen farther away; on_disk: whether its settings were read from
+    path: None for a project in memory; on_disk: whether its settings were read from
     there; asked: digest of the user's input (`uptodate`); found: the checkpoint of an earlier design with the same input; hold:
     context that releases the lock of the directory; without_waves: see `config.completion.without_waves`; values: of the scene
     parameters of a network, None for the middle of their ranges.
@@ -72,8 +91,6 @@ class Project:
     path: Path | None
     settings: Settings
     picture: Picture
-    profile: Picture | None = None
-    second: Picture | None = None
     asked: str = ""
     found: Checkpoint | None = None
     hold: ExitStack = field(default_factory=ExitStack, repr=False)
@@ -93,30 +110,14 @@ class Project:
             raise no_project(path)
         given = settings.read(path / TOML)
         try:
-            goal = given.get("target", {})
-            picture = _picture(
-                path, goal.get("file", "target.png"), goal.get("encoding", "srgb") == "linear", goal.get("color", False)
-            )
-            light = given.get("source", {})
-            profile = light.get("profile")
-            for table in (light, *light.get("also", ())):
-                for key in attachments.STEMS.keys() & table.keys():
-                    _within(table[key])
-            given["source"] = attachments.attached(light, path)
-            if (how := given.get("design", {})).get("robust"):
-                _within(how["robust"])
-                given["design"] = attachments.with_errors(how, path)
-            if "shape_file" in (screen := given.get("screen", {})):
-                _within(screen["shape_file"])
-                given["screen"] = attachments.with_shape(screen, path)
-            if index := given.get("lens", {}).get("index_file"):
-                _within(index)
-                given["lens"] = attachments.with_index(given["lens"], path)
-            full = complete(given, picture.aspect)
-            other = full.get("second", {}).get("file")
-            second = _picture(path, other, full["target"]["encoding"] == "linear") if other else None
+            goal = TargetSettings.of(given.get("target", {}))
+            name = goal.file or "target.png"
+            for file in (name, *(table[row.key] for table, row in attachments.names_in(given))):
+                _within(file)
+            picture = read_picture(path / name, goal.encoding == "linear", goal.color)
+            full = complete(attachments.attached(attachments.located(given, path)), picture.aspect)
             build_stages(full), build_options(full)  # validates the design, too
-            return cls(path, full, picture, _picture(path, profile, True) if profile else None, second, on_disk=True)
+            return cls(path, full, picture, on_disk=True)
         except InputError as error:
             raise InputError(f"{path / TOML}: {plain(f'{error}')}") from error
 
@@ -125,9 +126,14 @@ class Project:
         return InputError(f"{self.path / TOML}: {plain(words)}" if self.on_disk else words)
 
     @property
+    def second(self) -> np.ndarray | None:
+        """The picture on a screen farther away, irradiance, or None."""
+        return content(self.settings.second or {}, "file", np.ndarray)
+
+    @property
     def over(self) -> Ranges | None:
         """Ranges over which its network is trained, or None."""
-        return Ranges.parse(value_of(self.settings["design"], "design.over"))
+        return Ranges.parse(self.settings.design.over)
 
     def at(self, text: str | None) -> Project:
         """The project at parameter values "throw=300" (`Ranges.values`) of a network trained over ranges; unchanged for None.
@@ -149,51 +155,44 @@ class Project:
         return scene if self.values is None or self.over is None else self.over.scene(scene, self.values)
 
     def _scene(self, given: Mapping[str, Any] | None) -> Scene:
-        profile = None if self.profile is None else self.profile.irradiance()
         if not given:
             try:
-                return settings.build_scene(self.settings, profile)
+                return settings.build_scene(self.settings)
             except InputError as error:
                 raise self.error(f"{error}") from error
-        changed = {section: dict(values) for section, values in self.settings.items()}
-        changed["design"].pop("over", None)  # does not apply to another light
-        before = changed["source"]["type"]
-        own = settings.implied(settings.by_section(given))
-        for section, values in own.items():
-            changed[section] |= values
-        changed["screen"] = attachments.with_shape(changed["screen"])
-        _change(changed["source"], before, {*own.get("source", ())})
-        settings.refuse_unused(changed["source"], given)
-        if changed["source"]["type"] not in sources.used_by("profile"):
-            changed["source"].pop("profile", None)
-        changed = settings.with_defaults(changed)
-        complete_source(changed["source"], changed["lens"])  # further conditions of a design on its source do not apply to an image
-        return settings.build_scene(changed, profile)
+        own = attachments.attached(settings.implied(settings.by_section(given)))
+        s = self.settings
+        other = _other_source(s.source, own.get("source", {}))
+        settings.refuse_unused(other, given)
+        # Further conditions of a design on its source do not apply to an image.
+        source = complete_source(SourceSettings.of(other), s.lens)
+        lens, screen = s.lens.changed(**own.get("lens", {})), s.screen.changed(**own.get("screen", {}))
+        return settings.build_scene(s.changed(source=source, lens=lens, screen=screen))
 
     def target(self, scene: Scene) -> np.ndarray:
         """The target on the screen of the scene, (n_x, n_y), or (3, n_x, n_y) in colour."""
-        t, light = self.settings["target"], self.picture.irradiance()
-        if value_of(t, "target.sheet"):
+        t, light = self.settings.target, self.picture.irradiance()
+        if t.sheet:
             return np.mean([own / own.sum() for own in self.targets(scene)], axis=0)
         if light.ndim == 3:
-            whole = target_on_screen(light.sum(0), tuple(t["size"]), scene.screen, t["flip"])
-            parts = [target_on_screen(c, tuple(t["size"]), scene.screen, t["flip"]) if c.any() else 0.0 * whole for c in light]
+            whole = target_on_screen(light.sum(0), t.size, scene.screen, t.flip)
+            parts = [target_on_screen(c, t.size, scene.screen, t.flip) if c.any() else 0.0 * whole for c in light]
             return np.stack(parts)
-        return target_on_screen(light, tuple(t["size"]), scene.screen, t["flip"])
+        return target_on_screen(light, t.size, scene.screen, t.flip)
 
     def second_target(self, scene: Scene) -> np.ndarray | None:
         """The second target on its screen, (n_x, n_y), or None."""
-        if self.second is None or scene.second is None or scene.second.screen is None:
+        picture, section = self.second, self.settings.second
+        if picture is None or section is None or scene.second is None or scene.second.screen is None:
             return None
-        size, flip = tuple(self.settings["second"]["size"]), self.settings["target"]["flip"]
-        return target_on_screen(self.second.irradiance(), size, scene.second.screen, flip)
+        return target_on_screen(picture, section.size, scene.second.screen, self.settings.target.flip)
 
     def targets(self, scene: Scene) -> list[np.ndarray]:
         """The target of each lenslet on the screen of the scene, (n_x, n_y), j fastest; a single one for a common picture."""
-        t, light = self.settings["target"], self.picture.irradiance()
-        if not value_of(t, "target.sheet"):
+        t, light = self.settings.target, self.picture.irradiance()
+        if not t.sheet:
             return [self.target(scene)]
-        return [target_on_screen(tile, tuple(t["size"]), scene.screen, t["flip"]) for tile in tiles(light, scene.lens.array)]
+        return [target_on_screen(tile, t.size, scene.screen, t.flip) for tile in tiles(light, scene.lens.array)]
 
     def load(self) -> Checkpoint:
         """Read the checkpoint."""
@@ -217,7 +216,7 @@ class Project:
                 f"⟨lens.degree⟩ {list(scene.lens.degree)} is not that of the designed lens,"
                 f" {list(degree)}; design again to change it"
             )
-        done = state.state.stage == len(self.settings["design"]["stages"]) - 1
+        done = state.state.stage == len(self.settings.design.stages) - 1
         if done and field.shape != scene.lens.control:
             raise self.error(
                 f"⟨lens.control⟩ {list(scene.lens.control)} is not that of the designed lens,"
@@ -233,6 +232,40 @@ class Project:
             raise self.error(f"{error}") from error
         return Designed(scene, field, heights, state)
 
+    @property
+    def seed(self) -> int:
+        """Seed of all random numbers."""
+        return self.settings.design.seed
+
+    @property
+    def encoding(self) -> str:
+        """Encoding of its picture, and of its images."""
+        return self.settings.target.encoding
+
+    @property
+    def image(self) -> Path:
+        """Name of the image of its lens."""
+        return self.path / RENDER
+
+    def read(self, given: Mapping[str, Any]) -> LensData:
+        """The lens of the last checkpoint, at the parameter values; given: path in `config.table` -> value, overriding settings."""
+        scene = self.scene(given)
+        target = self.target(scene)
+        scene, field, heights, found = self.lens(scene)
+        return LensData(scene, field, heights, target, dict(found.results), found.state, found.provenance)
+
+    def refined_by_waves(self, state: State | None) -> bool:
+        """Whether a design in this state was refined on its wave image."""
+        return state is not None and any(stage.waves for stage in self.settings.design.stages[: state.stage + 1])
+
+    def resolution(self, scene: Scene, field: HeightField, heights: Tensor) -> Resolution:
+        """Resolution of the picture by diffraction."""
+        return Resolution.before(scene, self.settings.target.size)
+
+    def moved(self, path: Path) -> Project:
+        """The project in another directory."""
+        return replace(self, path=path)
+
     def _trained(self, state: State) -> Tensor:
         """Heights (n, m), mm, from the network at the parameter values."""
         if not state.parameters:
@@ -246,11 +279,7 @@ class Project:
         project.toml is written last, so that its presence implies that of the others.
         """
         path = path or self.path
-        self.picture.write(path / self.settings["target"]["file"])
-        if self.profile is not None:
-            self.profile.write(path / self.settings["source"]["profile"])
-        if self.second is not None:
-            self.second.write(path / self.settings["second"]["file"])
+        write_bytes(path / self.settings.target.file, self.picture.encoded())
         for file in attachments.of(self.settings):
             write_bytes(path / file, file.data)
         self.write_settings(path)
@@ -260,20 +289,15 @@ class Project:
         write_bytes((path or self.path) / TOML, settings.dump(self.settings).encode())
 
 
-def _change(source: Settings, before: str, given: set[str]) -> None:
-    """Read the files named by new keys of [source], and remove that of another type."""
-    if given - {"polarisation"}:  # a changed source replaces all further ones
-        source.pop("also", None)
-    if source["type"] != before and "file" not in given:
-        source.pop("file", None)
-    source |= attachments.attached(source)
+def _other_source(source: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The [source] section with other keys: a changed source replaces all further ones, and another type has another file."""
+    gone = {"also"} if given.keys() - {"polarisation"} else set()
+    type = given.get("type", source["type"])
+    gone |= {"file"} if type != source["type"] else set()
+    gone |= set() if type in sources.used_by("profile") else {"profile"}
+    return {key: value for key, value in source.items() if key not in gone} | dict(given)
 
 
 def _within(name: str) -> None:
     if name != Path(name).name or name in ("", ".", "..", TOML, *MADE):
         raise InputError(f"a file of a project must be the name of one within the project, got {name!r}")
-
-
-def _picture(directory: Path, name: str, linear: bool, color: bool = False) -> Picture:
-    _within(name)
-    return read_picture(directory / name, linear, color)

@@ -19,6 +19,7 @@ from torch import Tensor
 from caustic_cli import __version__
 from caustic_cli.config import settings
 from caustic_cli.config.settings import Settings
+from caustic_cli.config.table import options_of
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import read_bytes, refuse_foreign, sha256_of, write_bytes
 from caustic_cli.io.heightmaps import beside
@@ -33,19 +34,18 @@ BEGUN = "design"
 #: Largest record read, bytes; a larger file is not a record of this program.
 MOST_RECORDED = 1 << 24
 #: Settings of a single run that name files.
-FILES = ("source.file", "source.intensity", "screen.shape_file")
+FILES = tuple(row.path for row in options_of("render") if row.file)
 
 
-def digest(full: Settings, *pictures: Picture | None) -> str:
-    """Hash of complete settings, the pictures and files they refer to, and the lens that the design starts from."""
+def digest(full: Settings, picture: Picture) -> str:
+    """Hash of complete settings, the picture and the files they refer to, and the lens that the design starts from."""
     found = hashlib.sha256(f"{__version__}\n{settings.dump(full)}".encode())
-    for picture in filter(None, pictures):
-        found.update(f"{picture.values.shape}{picture.values.dtype}{picture.encoding}".encode())
-        found.update(np.ascontiguousarray(picture.values).tobytes())
+    found.update(f"{picture.values.shape}{picture.values.dtype}{picture.encoding}".encode())
+    found.update(np.ascontiguousarray(picture.values).tobytes())
     for file in attachments.of(full):
         found.update(hashlib.sha256(file.data).digest())
-    start = Path(full["design"]["start"])
-    named = full["design"]["start"] in ("transport", "offset")  # whatever the directory holds of these names
+    start = Path(full.design.start)
+    named = full.design.start in ("transport", "offset")  # whatever the directory holds of these names
     if not named and is_project(start):
         found.update(sha256_of(start / CHECKPOINT).encode())
     elif not named and start.is_file():
@@ -55,7 +55,7 @@ def digest(full: Settings, *pictures: Picture | None) -> str:
 
 def inputs(project: Project) -> dict[str, str]:
     """Digests stored in a checkpoint: `asked`, of the user's input, and `settings`, of the complete settings."""
-    return {"asked": project.asked, "settings": digest(project.settings, project.picture, project.profile, project.second)}
+    return {"asked": project.asked, "settings": digest(project.settings, project.picture)}
 
 
 def asked_of(project: Project, checkpoint: Checkpoint) -> str:
@@ -119,10 +119,10 @@ def is_begun(path: Path, asked: str) -> bool:
 
 def _undesigned(project: Project) -> str:
     """Hash of a project's settings and files without the refractive index that was designed, a file that settings name."""
-    full, lens = project.settings, project.settings["lens"]
-    if lens.get("gradient") == "free":
-        full = full | {"lens": {key: value for key, value in lens.items() if key != "index_file"}}
-    return digest(full, project.picture, project.profile, project.second)
+    full = project.settings
+    if full.lens.gradient == "free":
+        full = full.changed(lens=full.lens.without("index_file"))
+    return digest(full, project.picture)
 
 
 def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
@@ -162,7 +162,7 @@ class Outputs:
     def __init__(self, project: Project, command: str, options: dict, paths: Iterable[Path | None]):
         self.record, self.paths = project.path / RECORD, [p for p in paths if p is not None]
         given = {k: str(v) for k, v in sorted(options.items())}
-        inputs = [digest(project.settings, project.picture, project.profile, project.second), sha256_of(project.path / CHECKPOINT)]
+        inputs = [digest(project.settings, project.picture), sha256_of(project.path / CHECKPOINT)]
         inputs += [sha256_of(Path(options[name])) for name in FILES if options.get(name)]
         self.asked = hashlib.sha256(json.dumps([command, given, inputs]).encode()).hexdigest()
         self.key = " ".join(map(os.path.realpath, self.paths))

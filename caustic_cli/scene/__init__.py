@@ -3,8 +3,15 @@ here."""
 
 from __future__ import annotations
 
-from caustic_cli.scene.aperture import Aperture, Pupil
-from caustic_cli.scene.elements import Component, check_compatible_with_elements, check_positions, surface_name
+from caustic_cli.scene.aperture import Aperture, CircularAperture, Pupil
+from caustic_cli.scene.elements import (
+    COMPONENTS,
+    Component,
+    FoldMirror,
+    check_compatible_with_elements,
+    check_positions,
+    surface_name,
+)
 from caustic_cli.scene.freeform import FreeForm, SecondTarget
 from caustic_cli.scene.lens import Lens, Offset
 from caustic_cli.scene.light import Light
@@ -12,10 +19,13 @@ from caustic_cli.scene.screen import Screen
 from caustic_cli.scene.sources import Disc, PlaneWave, Points, Source
 
 __all__ = [
+    "COMPONENTS",
     "Aperture",
     "Band",
+    "CircularAperture",
     "Component",
     "Disc",
+    "FoldMirror",
     "FreeForm",
     "Lens",
     "Light",
@@ -73,8 +83,7 @@ class Scene:
         self._check_elements()
         if self.second is not None:
             self.second.check(self.screen)
-        if not self.lens.mirror and self.screen.z <= self.lens.z_in:
-            raise InputError(f"⟨screen.z⟩ must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm")
+        self.lens.interaction.check_screen(self.screen.z, self.lens.z_in)
         self.screen.check_curvature()
         if self.source.nearest >= self.lens.z_in:
             raise InputError(
@@ -119,10 +128,7 @@ class Scene:
     @property
     def pupil(self) -> Pupil:
         """The aperture that the source illuminates: the lens' entrance, or the first element in front of it."""
-        first = next(iter(self.before), None)
-        if first is not None:
-            return Pupil(first.half_size, first.z, first.round)
-        return Pupil(self.lens.half_size, self.lens.z_in, self.lens.round)
+        return next(iter(self.before), self.lens).pupil
 
     @property
     def lowest(self) -> float:
@@ -132,7 +138,7 @@ class Scene:
     @property
     def glasses(self) -> tuple[str, ...]:
         """Names of the dispersive materials of the lens and of the other lenses, without repeats."""
-        named = (None if self.lens.mirror else self.lens.glass, *(e.glass for e in self.elements))
+        named = (self.lens.interior.glass, *(e.glass for e in self.elements))
         return tuple(dict.fromkeys(glass for glass in named if glass is not None))
 
     def at(self, wavelength: float) -> Scene:
@@ -197,7 +203,7 @@ class Scene:
                 return (Band(self),)
             return tuple(Band(replace(self, light=Light(state)), 1.0 / len(states)) for state in states)
         bands = []
-        for k, (wavelength, part) in enumerate(zip(self.light.wavelengths, self.light.parts, strict=True)):
+        for wavelength, part, channel in zip(self.light.wavelengths, self.light.parts, self.light.channels, strict=True):
             scene = self.at(wavelength) if self.dispersive else self
-            bands += [Band(replace(scene, light=Light(state)), part / len(states), k if self.colored else None) for state in states]
+            bands += [Band(replace(scene, light=Light(state)), part / len(states), channel) for state in states]
         return tuple(bands)

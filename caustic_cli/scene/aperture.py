@@ -1,51 +1,191 @@
-"""Apertures: the clear area of a surface, and the pupil that sources illuminate."""
+"""Apertures: the outline of the clear area of a surface, and the pupil that sources illuminate.
+
+Notation
+    r_x, r_y    half widths of the aperture, mm; of a circle its radius, twice
+    x, y        points, mm;  u, v = x / r_x, y / r_y, in [-1, 1] over the rectangle of the half widths
+
+Points are arrays of NumPy or of torch.
+"""
 
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
 
 from caustic_cli.errors import InputError
 
 
+def _library(array) -> Any:
+    """NumPy or torch, of which an array is."""
+    return sys.modules[type(array).__module__]
+
+
 @dataclass(frozen=True)
 class Aperture:
-    """The clear aperture of a surface: a rectangle or a circle centred on the element's axis; infinite for an unbounded surface.
+    """The clear aperture of a surface: a rectangle centred on the element's axis; infinite for an unbounded surface.
 
     Args:
-        half_size: half widths of the rectangle, mm; for a circle its radius, given twice.
-        round: whether it is a circle.
+        half_size: half widths, mm.
     """
 
     half_size: tuple[float, float] = (math.inf, math.inf)
-    round: bool = False
 
-    def __post_init__(self):
-        if self.round and self.half_size[0] != self.half_size[1]:
-            raise InputError(f"half_size of a circular aperture must be its radius, given twice, got {self.half_size}")
+    #: Its name among the settings; whether it is a circle, for compiled loops, which take no objects.
+    name: ClassVar[str] = "rectangle"
+    round: ClassVar[bool] = False
+    #: Its area over the product of the half widths.
+    filled: ClassVar[float] = 4.0
 
     @property
     def radius(self) -> float | None:
         """Radius of a circular aperture, mm; None for a rectangle."""
-        return self.half_size[0] if self.round else None
+        return None
+
+    @property
+    def reach(self) -> float:
+        """Semi-aperture: largest distance of the aperture from the axis, mm."""
+        return math.hypot(*self.half_size)
+
+    @property
+    def area(self) -> float:
+        """Area, mm^2."""
+        return math.prod(self.half_size) * self.filled
+
+    def distances(self, x, y) -> tuple[tuple[Any, float], ...]:
+        """Distances (N,) of points from the axis, mm, that are at most the half widths beside them where a point is inside."""
+        return (abs(x), self.half_size[0]), (abs(y), self.half_size[1])
+
+    def edges(self, x, y, half_size: tuple[float, float]) -> tuple[Any, Any | None]:
+        """Signed distances of points from the edges along x and along y if the aperture is stretched to other half widths, positive
+        inside; None for the second if one edge goes all around."""
+        return half_size[0] - abs(x), half_size[1] - abs(y)
 
     def contains(self, x, y):
-        """Whether points x, y (mm) lie inside the aperture, borders included."""
+        """Whether points lie inside, borders included."""
         (rx, ry) = self.half_size
-        if self.round:
-            return x * x + y * y <= rx * rx
-        return (x.abs() <= rx) & (y.abs() <= ry)
+        return (abs(x) <= rx) & (abs(y) <= ry)
+
+    def covers(self, u, v, slack: float = 0.0):
+        """Whether points u, v in parts of the half widths lie inside, the border included, or beside it by the square `slack`."""
+        return (u * u <= 1.0 + slack) & (v * v <= 1.0 + slack)
+
+    def encloses(self, lows, highs):
+        """Whether it contains the rectangles from `lows` to `highs`, x and y, mm."""
+        inside = [(low >= -r) & (high <= r) for low, high, r in zip(lows, highs, self.half_size, strict=True)]
+        return inside[0] & inside[1]
+
+    def spread(self, u, v) -> tuple[Any, Any]:
+        """Points x, y, uniform over the aperture for u, v that are uniform over [0, 1]."""
+        (rx, ry) = self.half_size
+        return rx * (2.0 * u - 1.0), ry * (2.0 * v - 1.0)
+
+    def farthest(self, distance: Callable[[np.ndarray, np.ndarray], np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Largest distances (k,) mm of its points from figures about (x, y) in its plane, of which `distance` is the largest from
+        the axis."""
+        rx, ry = self.half_size
+        return np.max([distance(x + a, y + b) for a in (-rx, rx) for b in (-ry, ry)], axis=0)
+
+    def grown(self, by: float) -> Aperture:
+        """The aperture with a border of a width, mm."""
+        rx, ry = self.half_size
+        return type(self)((rx + by, ry + by))
+
+    def chord(self, at: float, along: int) -> float:
+        """Half the length, mm, of the line across the aperture along x (0) or y (1) at this distance from the axis."""
+        return self.half_size[along]
+
+
+@dataclass(frozen=True)
+class CircularAperture(Aperture):
+    """A circle centred on the element's axis.
+
+    Args:
+        half_size: the radius, twice, mm.
+    """
+
+    name: ClassVar[str] = "circle"
+    round: ClassVar[bool] = True
+    filled: ClassVar[float] = math.pi
+
+    def __post_init__(self):
+        if self.half_size[0] != self.half_size[1]:
+            raise InputError(f"half_size of a circular aperture must be its radius, given twice, got {self.half_size}")
+
+    @property
+    def radius(self) -> float:
+        """Radius, mm."""
+        return self.half_size[0]
+
+    @property
+    def reach(self) -> float:
+        """The radius."""
+        return self.half_size[0]
+
+    def distances(self, x, y) -> tuple[tuple[Any, float], ...]:
+        """As of an aperture."""
+        return ((_library(x).hypot(x, y), self.radius),)
+
+    def edges(self, x, y, half_size: tuple[float, float]) -> tuple[Any, Any | None]:
+        """As of an aperture; distances from an ellipse as along x."""
+        rx, ry = half_size
+        return rx - _library(x).hypot(x, y * (rx / ry)), None
+
+    def contains(self, x, y):
+        """As of an aperture."""
+        return x * x + y * y <= self.radius * self.radius
+
+    def covers(self, u, v, slack: float = 0.0):
+        """As of an aperture."""
+        return u * u + v * v <= 1.0 + slack
+
+    def encloses(self, lows, highs):
+        """As of an aperture: its farthest corner is inside."""
+        most = _library(lows[0]).maximum
+        x, y = (most(-low, high) for low, high in zip(lows, highs, strict=True))
+        return super().encloses(lows, highs) & (x**2 + y**2 <= self.radius * self.radius)
+
+    def spread(self, u, v) -> tuple[Any, Any]:
+        """As of an aperture."""
+        xp, r = _library(u), self.radius
+        return r * xp.sqrt(u) * xp.cos(2.0 * math.pi * v), r * xp.sqrt(u) * xp.sin(2.0 * math.pi * v)
+
+    def farthest(self, distance: Callable[[np.ndarray, np.ndarray], np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """As of an aperture."""
+        return distance(x, y) + self.radius
+
+    def chord(self, at: float, along: int) -> float:
+        """As of an aperture."""
+        return math.sqrt(max(0.0, self.radius * self.radius - at * at))
+
+
+#: Apertures by their names among the settings.
+APERTURES: dict[str, type[Aperture]] = {shape.name: shape for shape in (Aperture, CircularAperture)}
+
+
+def aperture_of(shape: str, size: tuple[float, float], setting: str) -> Aperture:
+    """The aperture of this shape and full size, mm, which a setting gives.
+
+    Raises:
+        InputError: the size is not that of a circle.
+    """
+    if APERTURES[shape].round and size[0] != size[1]:
+        raise InputError(f"⟨{setting}⟩ of a circular aperture must be its diameter, given twice, got {size[0]:g} x {size[1]:g}")
+    return APERTURES[shape]((size[0] / 2.0, size[1] / 2.0))
 
 
 @dataclass(frozen=True)
 class Pupil:
-    """The aperture that sources illuminate: half widths, mm; z, mm; and whether it is a circle."""
+    """The aperture that sources illuminate, and its z, mm."""
 
-    half_size: tuple[float, float]
+    aperture: Aperture
     z: float
-    round: bool = False
 
     @property
-    def aperture(self) -> Aperture:
-        """The aperture without its position."""
-        return Aperture(self.half_size, self.round)
+    def half_size(self) -> tuple[float, float]:
+        """Half widths of the aperture, mm."""
+        return self.aperture.half_size

@@ -14,11 +14,14 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
 
 from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError, at_least
-from caustic_cli.scene.aperture import Aperture
+from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of
 from caustic_cli.scene.freeform import FreeForm
+from caustic_cli.scene.interaction import Reflecting, Refracting
 from caustic_cli.scene.materials import refractive_index
 
 #: Largest semi-aperture of a sphere, as a fraction of its radius: beyond it light arrives near grazing incidence.
@@ -32,15 +35,14 @@ SIDES = ("front", "back")
 
 @dataclass(frozen=True)
 class Component:
-    """A singlet lens or a mirror; see the module.
+    """A singlet lens; see the module.
 
     Args:
-        kind: lens or mirror.
         z: of its first vertex, mm.
         size: full width and height of its aperture, mm.
-        thickness: centre thickness of a lens, mm.
-        radius: radii of curvature (front, back), mm; a mirror uses the first only.
-        index: refractive index of a lens.
+        thickness: centre thickness, mm.
+        radius: radii of curvature (front, back), mm.
+        index: refractive index.
         absorption: absorption coefficient of its glass, 1/mm.
         glass: a dispersive material, by its name in `materials`; None for `index` at every wavelength.
         aperture: rectangle, or circle, the largest that fits into size.
@@ -52,7 +54,6 @@ class Component:
         InputError: a value is out of range, the surfaces cross within the aperture, or a mirror does not fold the axis.
     """
 
-    kind: str
     z: float
     size: tuple[float, float]
     thickness: float = default("element.thickness")
@@ -65,28 +66,27 @@ class Component:
     free: str = default("element.free")
     surfaces: tuple[FreeForm | None, FreeForm | None] = (None, None)
 
+    #: What its surfaces do with light; their names, and those of the refracting ones.
+    interaction: ClassVar[Refracting | Reflecting] = Refracting()
+    sides: ClassVar[tuple[str, ...]] = SIDES
+    refracting: ClassVar[tuple[str, ...]] = SIDES
+
     def __post_init__(self):
-        for key, value in (("type", self.kind), *((k, getattr(self, k)) for k in ("z", "size", "aperture", "free", "tilt"))):
-            check(f"element.{key}", value)
+        for key in ("z", "size", "aperture", "free", "tilt"):
+            check(f"element.{key}", getattr(self, key))
         for r in self.radius:
             if isinstance(r, bool) or not isinstance(r, int | float) or math.isnan(r) or r == 0:
                 raise InputError(f"⟨element.radius⟩ must be non-zero numbers of mm or inf, got {list(self.radius)}")
-        if self.round and self.size[0] != self.size[1]:
-            raise InputError(
-                f"⟨element.size⟩ of a circular aperture must be its diameter, given twice, got {self.size[0]:g} x {self.size[1]:g}"
-            )
+        _ = self.opening
         for side, r in zip(self.sides, self.radius, strict=False):
             if self.reach > STEEPEST * abs(r):
                 raise InputError(
                     f"⟨element.radius⟩ of the {side} of the {self.kind} at z = {self.z:g} mm must be at least"
                     f" {self.reach / STEEPEST:.4g} mm either way for its aperture to lie on the sphere, got {r:g} mm"
                 )
-        if self.mirror:
-            self._check_mirror()
-        else:
-            self._check_lens()
+        self._check()
 
-    def _check_lens(self) -> None:
+    def _check(self) -> None:
         for key in ("thickness", "index", "absorption"):
             check(f"element.{key}", getattr(self, key))
         if any(self.tilt):
@@ -98,25 +98,13 @@ class Component:
                 f" {at_least(self.thickness - rim, 4)} mm for glass at the rim of its aperture, got {self.thickness:g} mm"
             )
 
-    def _check_mirror(self) -> None:
-        if self.free in ("back", "both"):
-            raise InputError(f"⟨element.free⟩ of a mirror must be none or front, its only surface, got {self.free}")
-        turned = [abs(t) for t in self.tilt if t]
-        if len(turned) != 1 or turned[0] < LEAST_TILT:
-            raise InputError(
-                "⟨element.tilt⟩ of a mirror must turn it about x or about y, one of them, by at least"
-                f" {LEAST_TILT:g} degrees, such as [45, 0], got {list(self.tilt)}"
-            )
+    def check_place(self, lens: tuple[float, float]) -> None:
+        """Check that it may stand where it does beside a lens with this z of the entrance and of the centre of the exit, mm."""
 
     @property
-    def mirror(self) -> bool:
-        """Whether it is a mirror."""
-        return self.kind == "mirror"
-
-    @property
-    def sides(self) -> tuple[str, ...]:
-        """Names of its surfaces."""
-        return SIDES[:1] if self.mirror else SIDES
+    def kind(self) -> str:
+        """lens or mirror."""
+        return self.interaction.kind
 
     @property
     def free_sides(self) -> tuple[str, ...]:
@@ -124,24 +112,24 @@ class Component:
         return tuple(side for side in self.sides if self.free in (side, "both"))
 
     @property
-    def round(self) -> bool:
-        """Whether the aperture is a circle."""
-        return self.aperture == "circle"
-
-    @property
     def half_size(self) -> tuple[float, float]:
         """Half widths of the aperture, mm."""
-        return self.size[0] / 2.0, self.size[1] / 2.0
+        return self.opening.half_size
 
-    @property
+    @cached_property
     def opening(self) -> Aperture:
         """Clear aperture of each of its surfaces."""
-        return Aperture(self.half_size, self.round)
+        return aperture_of(self.aperture, self.size, "element.size")
+
+    @property
+    def pupil(self) -> Pupil:
+        """Its aperture at the first vertex."""
+        return Pupil(self.opening, self.z)
 
     @property
     def reach(self) -> float:
         """Semi-aperture: largest distance of the aperture from the axis, mm."""
-        return self.half_size[0] if self.round else math.hypot(*self.half_size)
+        return self.opening.reach
 
     def sag(self, side: str) -> float:
         """Sag of a side at the edge of the aperture, mm."""
@@ -154,18 +142,74 @@ class Component:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Range of z that it occupies, mm; a tilted mirror is represented by its vertex."""
-        if self.mirror:
-            return self.z, self.z
+        """Range of z that it occupies, mm."""
         low, high = (
             self.sag(side) if f is None else float(f.heights.min() if side == "front" else f.heights.max())
             for side, f in zip(SIDES, self.surfaces, strict=True)
         )
         return self.z + min(0.0, low), self.z + self.thickness + max(0.0, high)
 
+    @property
+    def thinnest(self) -> float:
+        """Least thickness of its glass without designed surfaces, mm; infinite without glass."""
+        return self.thickness + min(0.0, self.sag("back") - self.sag("front"))
+
+    def axis_behind(self, leg: Any) -> Any:
+        """The segment of the axis (`optics.frames.AxisSegment`) behind it, from that in front of it."""
+        return leg
+
     def at(self, wavelength: float) -> Component:
         """The component with its index evaluated at a wavelength, nm."""
         return self if self.glass is None else replace(self, index=refractive_index(self.glass, wavelength))
+
+
+@dataclass(frozen=True)
+class FoldMirror(Component):
+    """A tilted mirror, which folds the axis and uses the first radius only."""
+
+    interaction: ClassVar[Refracting | Reflecting] = Reflecting()
+    sides: ClassVar[tuple[str, ...]] = SIDES[:1]
+    refracting: ClassVar[tuple[str, ...]] = ()
+
+    def _check(self) -> None:
+        if self.free in ("back", "both"):
+            raise InputError(f"⟨element.free⟩ of a mirror must be none or front, its only surface, got {self.free}")
+        turned = [abs(t) for t in self.tilt if t]
+        if len(turned) != 1 or turned[0] < LEAST_TILT:
+            raise InputError(
+                "⟨element.tilt⟩ of a mirror must turn it about x or about y, one of them, by at least"
+                f" {LEAST_TILT:g} degrees, such as [45, 0], got {list(self.tilt)}"
+            )
+
+    def check_place(self, lens: tuple[float, float]) -> None:
+        """As of a component.
+
+        Raises:
+            InputError: it is in front of the lens.
+        """
+        if self.z < lens[0]:
+            raise InputError(
+                f"⟨element.z⟩ of a mirror must lie behind the lens (beyond {lens[1]:g} mm), got {self.z:g} mm: the lens stands on"
+                " its source's axis, so that a mirror in front of it is equivalent to a rotated source"
+            )
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """That of its vertex."""
+        return self.z, self.z
+
+    @property
+    def thinnest(self) -> float:
+        """It has no glass."""
+        return math.inf
+
+    def axis_behind(self, leg: Any) -> Any:
+        """Folded."""
+        return leg.folded(self.z, self.tilt)
+
+
+#: Components by their names among the settings.
+COMPONENTS: dict[str, type[Component]] = {shape.interaction.kind: shape for shape in (Component, FoldMirror)}
 
 
 def surface_name(number: int, side: str) -> str:
@@ -184,12 +228,8 @@ def check_positions(elements: Sequence[Component], lens: tuple[float, float], so
         InputError: naming the element and the accepted range.
     """
     bodies = [(f"the {e.kind} of [[element]] {k + 1}", *e.extent) for k, e in enumerate(elements)]
-    for (_, low, _), e in zip(bodies, elements, strict=True):
-        if e.mirror and low < lens[0]:
-            raise InputError(
-                f"⟨element.z⟩ of a mirror must lie behind the lens (beyond {lens[1]:g} mm), got {low:g} mm: the lens stands on its"
-                " source's axis, so that a mirror in front of it is equivalent to a rotated source"
-            )
+    for e in elements:
+        e.check_place(lens)
     own = ("the free-form lens", *lens)
     before = [b for b in bodies if b[1] < lens[0]]
     sequence = [*before, own, *bodies[len(before) :]]

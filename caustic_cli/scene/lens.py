@@ -11,14 +11,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE, check, check_all, default
 from caustic_cli.errors import InputError
+from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of
 from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.gradient import Gradient
+from caustic_cli.scene.interaction import Interior, Reflecting, Refracting
 
 
 @dataclass(frozen=True)
@@ -174,22 +177,29 @@ class Lens:
             raise InputError(f"⟨lens.height_range⟩ must ascend, got [{low:g}, {high:g}]")
         if self.gradient is not None and self.mirror:
             raise InputError("⟨lens.gradient⟩ needs a lens: light never enters a mirror")
-        if self.round and self.size[0] != self.size[1]:
-            raise InputError(
-                f"⟨lens.size⟩ of a circular aperture must be its diameter, given twice, got {self.size[0]:g} x {self.size[1]:g}"
-            )
+        _ = self.opening
 
     def _check_array(self) -> None:
-        if self.round:
+        if self.aperture != Aperture.name:
             raise InputError("⟨lens.aperture⟩ of an array must be a rectangle, which its lenslets fill")
         if self.knots is not None:
             raise InputError("⟨lens.array⟩ has knots of its own: give no knots_u and knots_v")
 
     @property
+    def interaction(self) -> Refracting | Reflecting:
+        """What its surface does with light."""
+        return Reflecting() if self.mirror else Refracting()
+
+    @property
+    def kind(self) -> str:
+        """lens or mirror."""
+        return self.interaction.kind
+
+    @property
     def cut_from(self) -> int:
         """The side from which a tool machines the free-form surface: 1 from +z, or -1 from -z for a mirror, the side of its
         light."""
-        return -1 if self.mirror else 1
+        return self.interaction.side
 
     @property
     def arrayed(self) -> bool:
@@ -201,10 +211,15 @@ class Lens:
         """(r_x, r_y) mm."""
         return self.size[0] / 2.0, self.size[1] / 2.0
 
+    @cached_property
+    def opening(self) -> Aperture:
+        """Its aperture."""
+        return aperture_of(self.aperture, self.size, "lens.size")
+
     @property
-    def round(self) -> bool:
-        """Whether the aperture is a circle."""
-        return self.aperture == "circle"
+    def pupil(self) -> Pupil:
+        """Its aperture at the entrance."""
+        return Pupil(self.opening, self.z_in)
 
     @property
     def lowest(self) -> float:
@@ -212,14 +227,19 @@ class Lens:
         return self.z_in + (0.0 if self.entrance is None else min(0.0, float(self.entrance.heights.min())))
 
     @property
+    def interior(self) -> Interior:
+        """What light crosses in front of the exit."""
+        return self.interaction.interior(Interior(self.index, self.absorption, self.fresnel, self.glass))
+
+    @property
     def inside(self) -> float:
         """Refractive index of the medium in front of the exit: that of the glass, or 1 for a mirror."""
-        return 1.0 if self.mirror else self.index
+        return self.interior.index
 
     @property
     def effective_index(self) -> float:
         """n of the paraxial deflection (n - 1) times the slope: the index, or -1 for a mirror (Snell's law with index -1)."""
-        return -1.0 if self.mirror else self.index
+        return self.interaction.effective_index(self.index)
 
     def height_bounds(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the control heights at control points x (n,), y (m,): two (n, m) float64, mm.

@@ -56,6 +56,21 @@ class Light:
             )
 
     @property
+    def effects(self) -> frozenset[str]:
+        """Names of the effects on rays that it causes."""
+        return frozenset(() if self.polarisation is None else {"polarisation"})
+
+    @property
+    def channels(self) -> tuple[int | None, ...]:
+        """Colour channel of the image that each wavelength belongs to; None for all without colours."""
+        return tuple(k if self.color else None for k in range(len(self.wavelengths)))
+
+    @property
+    def planes(self) -> tuple[int, ...]:
+        """Leading dimensions of an image: (3,), its colour channels, or ()."""
+        return (len(RGB),) if self.color else ()
+
+    @property
     def parts(self) -> tuple[float, ...]:
         """Fraction of the power at each wavelength; they sum to 1."""
         weights = self.weights or (1.0,) * len(self.wavelengths)

@@ -26,8 +26,10 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.resolution import GREEN, Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.optics.waves import NoWaveImage, wave_image
+from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Scene
+from caustic_cli.scene.features import FREE_ENTRANCE, GRADIENT, features_of
 from caustic_cli.studies.measurement import Reference
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study, plain_ticks
@@ -89,13 +91,11 @@ def run_diffraction(
     Raises:
         InputError: the index varies, or the entrance is free-form.
     """
-    if scene.lens.gradient is not None or scene.two_sided:
+    if features_of(scene, (GRADIENT, FREE_ENTRANCE)):
         raise InputError("⟨study⟩ diffraction is of lenses of one index with a flat entrance")
     plane = replace(scene, source=PlaneWave(scene.source.power), light=Light())
     own = plane.lens.size[0]
-    cases = [("lens size", size, GREEN, 0.0, size / own) for size in SIZES]
-    cases += [("wavelength", wavelength, wavelength, 0.0, 1.0) for wavelength in WAVELENGTHS]
-    cases += [("source size", angle, GREEN, angle, 1.0) for angle in ANGLES]
+    cases = _cases(own)
     count = rays or A_PIXEL * math.prod(plane.screen.resolution)
     rows, drawn = [], {}
     for k, (series, value, wavelength, angle, factor) in enumerate(cases):
@@ -113,18 +113,9 @@ def run_diffraction(
             continue
         seconds = time.perf_counter() - began
         seen = Resolution.at(replace(one, light=Light(None, (wavelength,))), net, lifted)
-        rows.append(
-            {
-                "series": series,
-                "value": value,
-                "error": reference.error_of(light.image.cpu()),
-                "noise": reference.error,
-                "blur": seen.blur / seen.pixel,
-                "seconds": seconds,
-                "rays_seconds": ray_seconds,
-                "samples": max(light.samples),
-            }
-        )
+        error, blur = reference.error_of(light.image.cpu()), seen.blur / seen.pixel
+        found = (series, value, error, reference.error, blur, seconds, ray_seconds, max(light.samples))
+        rows.append(dict(zip(COLUMNS, found, strict=True)))
         if progress is not None:
             progress(k + 1, len(cases))
     if not rows:
@@ -141,6 +132,15 @@ def run_diffraction(
         "lens": own,
     }
     return Study("diffraction", COLUMNS, rows, {}, _advice(rows), about, "value", PLOTS)
+
+
+def _cases(own: float) -> list[tuple[str, float, float, float, float]]:
+    """Series, value, wavelength, nm, full angle of the source, degrees, and scale of a lens of this size, mm."""
+    return [
+        *(("lens size", size, GREEN, 0.0, size / own) for size in SIZES),
+        *(("wavelength", wavelength, wavelength, 0.0, 1.0) for wavelength in WAVELENGTHS),
+        *(("source size", angle, GREEN, angle, 1.0) for angle in ANGLES),
+    ]
 
 
 def _rays(scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int) -> tuple[Reference, float]:

@@ -29,8 +29,8 @@ from caustic_cli.optics.plan import Plan, compile_plan
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose, is_lowered
-from caustic_cli.optics.waves import NoWaveImage, wave_image
-from caustic_cli.optics.waves.image import UNASKED
+from caustic_cli.optics.waves.image import UNASKED, wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, Study
@@ -272,7 +272,7 @@ def _row(
 ) -> dict | None:
     name, amount, bare = effect.name, OWN, None
     if not effect.present:
-        made = BY_NAME[name].probe(scene, heights)
+        made = None if BY_NAME[name].of_glass and scene.lens.mirror else BY_NAME[name].probe(scene, heights)
         if made is None:
             return None
         scene, bare, amount = made.scene, made.baseline, made.words

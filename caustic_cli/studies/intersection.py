@@ -212,23 +212,8 @@ def run_intersection(
         progress: called with (evaluations done, in total) after each.
     """
     repeats = checks.whole("⟨repeats⟩", REPEATS if repeats is None else repeats, 1, 1000)
-    settings = settings_of(case.field, most)
-    total, done = len(settings) * (1 + repeats), 0
     truth, hit, residual = reference(case)
-    prepared = backend_for("cpu").finder(case.field, case.rays.origin, case.rays.direction)
-    rows, times = [], [[] for _ in settings]
-    for k in range(-1, repeats):  # the first round is for the errors and warms the machine up
-        for i, (series, n) in enumerate(settings):
-            start = time.perf_counter()
-            t, status = _evaluate(case, prepared, series, n)
-            times[i].append(time.perf_counter() - start)
-            if k < 0:
-                rows.append({"series": series, "n_u": n, **_errors(case, t, status, truth, hit)})
-            done += 1
-            if progress is not None:
-                progress(done, total)
-    for row, (_, *seconds) in zip(rows, times, strict=True):
-        row |= {"seconds": statistics.median(seconds), "seconds_min": min(seconds), "seconds_max": max(seconds)}
+    rows = _measured(case, settings_of(case.field, most), repeats, truth, hit, progress)
     mesh = [row for row in rows if row["series"] == "mesh"]
     parts = [row["n_u"] for row in mesh]
     orders = {f"mesh, {name}": order(parts, [row[column] for row in mesh]) for name, column in FITTED.items()}
@@ -262,6 +247,32 @@ def run_intersection(
         "n_u",
         PLOTS,
     )
+
+
+def _measured(
+    case: Case,
+    settings: list[tuple[str, int | None]],
+    repeats: int,
+    truth: np.ndarray,
+    hit: np.ndarray,
+    progress: Callable[[int, int], None] | None,
+) -> list[dict]:
+    """A row for each setting, with its errors and its times."""
+    prepared = backend_for("cpu").finder(case.field, case.rays.origin, case.rays.direction)
+    rows, times, done = [], [[] for _ in settings], 0
+    for k in range(-1, repeats):  # the first round is for the errors and warms the machine up
+        for i, (series, n) in enumerate(settings):
+            start = time.perf_counter()
+            t, status = _evaluate(case, prepared, series, n)
+            times[i].append(time.perf_counter() - start)
+            if k < 0:
+                rows.append({"series": series, "n_u": n, **_errors(case, t, status, truth, hit)})
+            done += 1
+            if progress is not None:
+                progress(done, len(settings) * (1 + repeats))
+    for row, (_, *seconds) in zip(rows, times, strict=True):
+        row |= {"seconds": statistics.median(seconds), "seconds_min": min(seconds), "seconds_max": max(seconds)}
+    return rows
 
 
 def _evaluate(case: Case, prepared: Callable, series: str, n: int | None) -> tuple[Tensor, Tensor]:
@@ -335,38 +346,10 @@ def draw_convergence(study: Study, figure: Figure) -> None:
     figure.set_size_inches(10.0, 7.4)
     panels, style = figure.subplots(2, 2), styles(row["series"] for row in study.rows)
     table = {name: [row for row in study.rows if row["series"] == name] for name in style}
-    mesh, (newton,) = table["mesh"], table["newton"]
-    n = np.array([row["n_u"] for row in mesh], float)
+    (newton,), n = table["newton"], np.array([row["n_u"] for row in table["mesh"]], float)
     for axes, kind, columns in ((panels[0, 0], "z-error", ("z_mean", "z_max")), (panels[0, 1], "t-error", ("error", "t_max"))):
         orders = {word: study.orders[f"mesh, {word} {kind}"] for word in ("mean", "maximum")}
-        for word, column, line in zip(orders, columns, ("-", "--"), strict=True):
-            y = np.array([row[column] for row in mesh])
-            use = y > 0
-            axes.plot(
-                n[use],
-                y[use],
-                linestyle=line,
-                linewidth=1,
-                color=style["mesh"]["color"],
-                marker="o" if line == "-" else "^",
-                markersize=5,
-                markerfacecolor=None if line == "-" else "none",
-                label="mesh" if word == "mean" else "mesh, maximum",
-            )
-        for name, line in (("mesh+newton", "-"), ("newton", ":")):
-            points = [row for row in table[name] if row[columns[0]] > 0]
-            if points and name == "newton":
-                axes.axhline(points[0][columns[0]], color=style[name]["color"], linestyle=line, label=name)
-            elif points:
-                axes.plot(
-                    [row["n_u"] for row in points],
-                    [row[columns[0]] for row in points],
-                    color=style[name]["color"],
-                    linewidth=1,
-                    marker=style[name]["marker"],
-                    markersize=5,
-                    label=name,
-                )
+        _draw_errors(axes, table, style, columns)
         axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm), mean unless stated", title=f"{kind}; mesh: {_fit_words(orders)}")
     for name, rows in table.items():
         if name != "newton" and rows:
@@ -396,6 +379,34 @@ def draw_convergence(study: Study, figure: Figure) -> None:
         axes.set_xlabel("n$_u$ = n$_v$")
         axes.grid(which="major", linewidth=0.4)
     figure.legend(*_every_label(panels.flat), loc="outside lower center", ncols=5, fontsize="small")
+
+
+def _draw_errors(axes: Axes, table: dict[str, list[dict]], style: dict[str, dict], columns: tuple[str, str]) -> None:
+    """Mean and largest error of the mesh, and the mean ones of the other methods."""
+    mesh = table["mesh"]
+    n = np.array([row["n_u"] for row in mesh], float)
+    looks = (
+        {"linestyle": "-", "marker": "o", "markerfacecolor": None, "label": "mesh"},
+        {"linestyle": "--", "marker": "^", "markerfacecolor": "none", "label": "mesh, maximum"},
+    )
+    for column, look in zip(columns, looks, strict=True):
+        y = np.array([row[column] for row in mesh])
+        use = y > 0
+        axes.plot(n[use], y[use], linewidth=1, color=style["mesh"]["color"], markersize=5, **look)
+    for name, line in (("mesh+newton", "-"), ("newton", ":")):
+        points = [row for row in table[name] if row[columns[0]] > 0]
+        if points and name == "newton":
+            axes.axhline(points[0][columns[0]], color=style[name]["color"], linestyle=line, label=name)
+        elif points:
+            axes.plot(
+                [row["n_u"] for row in points],
+                [row[columns[0]] for row in points],
+                color=style[name]["color"],
+                linewidth=1,
+                marker=style[name]["marker"],
+                markersize=5,
+                label=name,
+            )
 
 
 def _every_label(panels: Iterable[Axes]) -> tuple[list[Artist], list[str]]:

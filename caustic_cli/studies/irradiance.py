@@ -44,7 +44,7 @@ def irradiance_figures(scene: Scene, image) -> dict[str, float]:
 def unit_figures(scene: Scene) -> dict[str, float | str]:
     """Figures power, of the source, power_unit, and irradiance_unit; fractions_of, what that power is."""
     unit, pupil = scene.light.unit, scene.pupil
-    words = scene.source.power_words(pupil.half_size, pupil.z, pupil.round)
+    words = scene.source.power_words(pupil)
     return {"power": scene.source.power, "power_unit": unit, "irradiance_unit": UNITS[unit][0], "fractions_of": words}
 
 
@@ -52,5 +52,5 @@ def source_figures(scene: Scene, on_target: float | None) -> dict[str, float | s
     """Figures of_source, the fraction of all the light that the source emits which lands on the picture, and source_emits, what
     all that light is; on_target: the same fraction of the source's power."""
     pupil = scene.pupil
-    part, words = scene.source.emitted(pupil.half_size, pupil.z, pupil.round)
+    part, words = scene.source.emitted(pupil)
     return {"of_source": None if on_target is None else part * on_target, "source_emits": words}

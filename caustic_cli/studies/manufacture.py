@@ -25,7 +25,7 @@ from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Aperture, Scene
 from caustic_cli.scene.materials import material
 
 #: Most sample points along each axis and per knot span.
@@ -38,12 +38,15 @@ RAYS = 100_000
 SHEET = 0.08
 #: Finite-difference steps of the sensitivities: of the throw, relative; of the index.
 STEP = 1e-4
-#: Figures that do not apply to a mirror.
-OF_GLASS = (
-    *("minimum_wall_mm", "minimum_wall_bound_mm", "stock_height_mm", "volume_cm3", "mass_g"),
-    *("critical_angle_deg", "steepest_incidence_deg", "internal_reflection_margin_deg"),
-    *("landing_mm_per_thousandth_index", "index_error_of_a_pixel"),
-)
+#: Figures that do not apply, by the kind of the lens.
+NOT_OF: dict[str, tuple[str, ...]] = {
+    "lens": (),
+    "mirror": (
+        *("minimum_wall_mm", "minimum_wall_bound_mm", "stock_height_mm", "volume_cm3", "mass_g"),
+        *("critical_angle_deg", "steepest_incidence_deg", "internal_reflection_margin_deg"),
+        *("landing_mm_per_thousandth_index", "index_error_of_a_pixel"),
+    ),
+}
 
 
 def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: float | None = None, seed: int = 0) -> dict:
@@ -63,16 +66,13 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         raise InputError(f"⟨tool_radius⟩ must be greater than 0 mm, got {tool_radius:g}")
     lens, pixel = scene.lens, max(scene.screen.pixel)
     z, *derivatives = sampled(field, heights, [_points(s) for s in field.spaces])
-    inside = torch.ones_like(z, dtype=torch.bool)
-    if lens.round:  # points outside the circle are replaced by the centre
-        (u, v) = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
-        inside, at = u[:, None] ** 2 + v[None, :] ** 2 <= 1.0, tuple(n // 2 for n in z.shape)
-        z, *derivatives = (torch.where(inside, t, t[at]) for t in (z, *derivatives))
+    inside, at = _within(lens.opening, z), tuple(n // 2 for n in z.shape)
+    z, *derivatives = (torch.where(inside, t, t[at]) for t in (z, *derivatives))  # points outside are replaced by the centre
     bends = curvature.largest(*(lens.cut_from * d for d in derivatives))
     bent, at = float(bends.max()), divmod(int(bends.argmax()), bends.shape[1])
     where = [(2.0 * k / (n - 1) - 1.0) * r for k, n, r in zip(at, z.shape, field.half_size, strict=True)]
     radius = 1.0 / bent if bent > 0 else None
-    volume = 1e-3 * float(z[inside].mean() - lens.z_in) * math.prod(lens.size) * (math.pi / 4.0 if lens.round else 1.0)
+    volume = 1e-3 * float(z[inside].mean() - lens.z_in) * lens.opening.area
     found = {
         "minimum_wall_mm": float(z.min()) - lens.z_in,
         "minimum_wall_bound_mm": float(heights.min()) - lens.z_in,
@@ -103,7 +103,13 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         "throw_error_of_a_pixel_mm": pixel / by_throw if by_throw > 0 else None,
         "index_error_of_a_pixel": pixel / by_index if by_index > 0 else None,
     }
-    return found | dict.fromkeys(OF_GLASS) if lens.mirror else found
+    return found | dict.fromkeys(NOT_OF[lens.kind])
+
+
+def _within(aperture: Aperture, z: Tensor) -> Tensor:
+    """Which of the points (n, m) of a grid over the half widths of an aperture lie inside."""
+    u, v = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
+    return aperture.covers(u[:, None], v[None, :])
 
 
 def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[str, float]:
@@ -111,9 +117,7 @@ def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[st
     if scene.lens.mirror or scene.two_sided:
         return {}
     (z,) = sampled(field, heights, [_points(s) for s in field.spaces], ((0, 0),))
-    if scene.lens.round:
-        u, v = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
-        z = z[u[:, None] ** 2 + v[None, :] ** 2 <= 1.0]
+    z = z[_within(scene.lens.opening, z)]
     return {"minimum_wall_mm": float(z.min()) - scene.lens.z_in, "stock_height_mm": float(z.max()) - scene.lens.z_in}
 
 

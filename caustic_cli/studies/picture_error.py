@@ -24,7 +24,7 @@ from caustic_cli.optics.plan import Plan
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.waves import NoWaveImage
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import FreeForm, Scene
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import retrace

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SOBOL_RAYS, stream
-from caustic_cli.optics.surfaces.cut import CutSurface
+from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
@@ -151,7 +152,7 @@ def mean_of(parts: list[Image]) -> Image:
 
 def retrace(
     scene: Scene,
-    field: HeightField | CutSurface,
+    field: HeightField | MeasuredSurface,
     heights: Tensor,
     target: np.ndarray | None,
     *,
@@ -197,24 +198,32 @@ def retrace(
             counted, target, tuple(trace(f"noise {k}", rays // PROBE) for k in (0, 1)) if noise else None
         )
     else:
-        parts: tuple[list[Image], list[Image]] = [], []
-        lights = [scene.part(k, 2) for k in (0, 1)]
-        while True:
-            for k in range(len(parts[0]), max(1, 2 * len(parts[0]))):
-                for part, name, light in zip(parts, ("render", "render, other half"), lights, strict=True):
-                    part.append(trace(f"{name} {k}" if k else name, rays // 2, light))
-            halves = mean_of(parts[0]), mean_of(parts[1])
-            counted = mean_of(list(halves))
-            figures = _figures_of_halves(counted, target, halves)
-            enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
-            if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _available(scene):
-                break
+        counted, figures = _in_halves(trace, scene, target, rays, quiet)
     require_energy_balance(counted, dtype)
     figures |= irradiance_figures(scene, counted.image) | unit_figures(scene) | source_figures(scene, figures["on_target"])
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     sampler = sampler_for(scene, counted.rays, seed, device)
     return limited_to_source(expose(scene, field, heights, sampler, filter, dtype, requests=requests)), figures
+
+
+def _in_halves(
+    trace: Callable[[str, int, Scene], Image], scene: Scene, target: np.ndarray | None, rays: int, quiet: float | None
+) -> tuple[Image, dict]:
+    """The mean of two independent halves of about `rays` rays, with its figures; of more where `quiet` requires them, see
+    `retrace`.  trace: images by name of the random numbers, number of rays and scene."""
+    parts: tuple[list[Image], list[Image]] = [], []
+    lights = [scene.part(k, 2) for k in (0, 1)]
+    while True:
+        for k in range(len(parts[0]), max(1, 2 * len(parts[0]))):
+            for part, name, light in zip(parts, ("render", "render, other half"), lights, strict=True):
+                part.append(trace(f"{name} {k}" if k else name, rays // 2, light))
+        halves = mean_of(parts[0]), mean_of(parts[1])
+        counted = mean_of(list(halves))
+        figures = _figures_of_halves(counted, target, halves)
+        enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
+        if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _available(scene):
+            return counted, figures
 
 
 def evaluation_rays(scene: Scene, usual: int = FINAL_RAYS) -> int:

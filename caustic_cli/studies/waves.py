@@ -12,8 +12,8 @@ from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.waves import NoWaveImage, WaveImage, wave_image
-from caustic_cli.optics.waves.image import UNASKED, Perturbation
+from caustic_cli.optics.waves.image import UNASKED, Perturbation, WaveImage, wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.materials import material
 from caustic_cli.studies.irradiance import irradiance_figures

@@ -123,12 +123,12 @@ class _Study:
         if project is None:
             full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
             project = Project(None, full, Picture(picture_of_disc(), "linear"))
-        chosen = {key: value for key, value in project.settings["design"].items() if key != "robust"}
-        project = replace(project, settings=project.settings | {"design": chosen})
+        chosen = project.settings.design.without("robust")
+        project = replace(project, settings=project.settings.changed(design=chosen))
         self.over = project.over
         self.problem, self.first = problem_of(project, device), None
-        if self.over is not None and chosen["start"] != "offset":
-            _, self.problem, self.first = first_heights(project, project.settings, self.problem)
+        if self.over is not None and chosen.start != "offset":
+            _, self.problem, self.first = first_heights(project, {"lens": dict(project.settings.lens)}, self.problem)
         scene, stages, own = self.problem.scene, [s for s in self.problem.stages if not s.waves], self.problem.options
         if not stages or scene.second is not None or scene.lens.arrayed:
             raise InputError(

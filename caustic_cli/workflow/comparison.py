@@ -140,7 +140,7 @@ def lens_of_disc() -> tuple[Scene, HeightField, Tensor]:
     full = complete({}, 1.0)
     scene = settings.build_scene(full)
     field = HeightField.of(scene.lens)
-    return scene, field, first_surface(scene, disc(scene, tuple(full["target"]["size"])), field, LEAST_CELLS).heights
+    return scene, field, first_surface(scene, disc(scene, full.target.size), field, LEAST_CELLS).heights
 
 
 def disc(scene: Scene, size: tuple[float, float]) -> np.ndarray:
@@ -198,7 +198,7 @@ def variants(
         if lens.knots is not None
         else tuple(min(n, max(NETWORK_CONTROL, p + 1)) for n, p in zip(lens.control, lens.degree, strict=True))
     )
-    if full["design"]["start"] == "transport":
+    if full.design.start == "transport":
         found.append((TRANSPORT, [replace(last, control=lens.control)], newton))
     for kind in ("none", "sparse", "dense"):
         if kind != "dense" or math.prod(net) <= NETWORK_CONTROL**2:  # weights: the square of the control points

@@ -22,7 +22,7 @@ from numba.core import event
 from caustic_cli.errors import is_out_of_memory
 from caustic_cli.optics.backends import backend_for, cuda_kernels
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
-from caustic_cli.optics.kernels import cache, fused, fused_functions
+from caustic_cli.optics.kernels import cache
 from caustic_cli.optics.trace import warm_up
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen
 from caustic_cli.workflow.reporter import Reporter
@@ -53,18 +53,14 @@ def choose_device(asked: str, say: Reporter) -> str:
 
 def is_cached() -> bool:
     """Whether the cache holds compiled kernels, judged by file names; also True if nothing can be cached."""
-    place = fused.backward.stats.cache_path
+    place = backend_for("cpu").cache_path()
     return cache.DIRECTORY is None or place is None or any(Path(place).glob("fused.backward-*.nbi"))
 
 
 def compile_part(part: str) -> None:
     """Compile one of PARTS into the cache, by calling it."""
-    if part == "splat":
-        fused_functions.compile_splat()
-    elif part == "adjoint":
-        fused_functions.compile_adjoint()
-    elif part == "surface":
-        fused_functions.compile_surface()
+    if part != "transport":
+        backend_for("cpu").compile_part(part)
     else:
         from caustic_cli.inverse import transport  # noqa: PLC0415
 

@@ -5,7 +5,6 @@ Nothing is written before everything the user gave has been checked.
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import math
 import signal
@@ -21,28 +20,26 @@ import numpy as np
 import torch
 
 from caustic_cli import __version__
-from caustic_cli.config import presets, settings
-from caustic_cli.config.completion import PLATE, WALL, Derivation, complete, shape_words
-from caustic_cli.config.settings import Settings, value_of
-from caustic_cli.config.table import TABLE
-from caustic_cli.config.wave_stages import without_waves
+from caustic_cli.config import settings
+from caustic_cli.config.completion import PLATE, WALL, complete, shape_words
+from caustic_cli.config.settings import Given
+from caustic_cli.config.table import TABLE, LensSettings
 from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.designer import Designer, InitialHeights, State
 from caustic_cli.inverse.reachability import largest_magnification
-from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
-from caustic_cli.io.picture import Picture, read_picture
+from caustic_cli.io.picture import Picture
 from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.kinds import OneSurface, kind_of, problem_of
 from caustic_cli.kinds.evaluation import Evaluated
-from caustic_cli.optics.obstruction import clear_shift
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.new import new_project
 from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, Project, is_project
 from caustic_cli.scene import Scene
@@ -105,82 +102,7 @@ def begin(
     Raises:
         InputError: invalid input; nothing was written.
     """
-    read = [settings.read(path, parameters=True) for path in (preset and presets.path_of(preset), config) if path]
-    if config and "source" in read[-1]:
-        read[-1]["source"] = attachments.attached(read[-1]["source"], config.parent)
-    if config and "design" in read[-1]:
-        read[-1]["design"] = attachments.with_errors(read[-1]["design"], config.parent)
-    if config and "screen" in read[-1]:
-        read[-1]["screen"] = attachments.with_shape(read[-1]["screen"], config.parent)
-    if config and "lens" in read[-1]:
-        read[-1]["lens"] = attachments.with_index(read[-1]["lens"], config.parent)
-    chosen = settings.by_section(given)
-    said = settings.merged({}, *map(settings.implied, (*read, chosen)))
-    if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given at the same level
-        glass = said["lens"].pop("glass")
-        say.say(f"⟨lens.index⟩ {said['lens']['index']:g} is used at all wavelengths, and {glass} is ignored")
-    if "design" in said:
-        said["design"] = attachments.with_errors(said["design"])
-    if "screen" in said:
-        said["screen"] = attachments.with_shape(said["screen"])
-    parameters = said.pop("", {})
-    invert = parameters.pop("invert", False)
-    if "elements" in parameters:  # those of the command line replace those of a configuration
-        said["element"] = {"list": parameters.pop("elements")}
-    by = Derivation(**parameters)
-    if "source" in said:
-        said["source"] = attachments.attached(said["source"])
-    if "lens" in said:
-        said["lens"] = attachments.with_index(said["lens"])
-    goal = said.get("target", {})
-    picture = (
-        target
-        if isinstance(target, Picture)
-        else read_picture(target, goal.get("encoding") == "linear", goal.get("color", False), invert)
-    )
-    if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
-        del said["source"]["weights"]
-    if goal.get("color", False):
-        if isinstance(target, Picture):
-            raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
-        light = [float(c) for c in picture.irradiance().sum((1, 2))]
-        said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
-    profile = said.get("source", {}).get("profile")
-    light = read_picture((config.parent if config else Path()) / profile, linear=True) if profile else None
-    full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
-    for key in ("index_range", "index_control", "index_layers"):
-        if f"lens.{key}" in given and full["lens"].get("gradient") != "free":
-            raise InputError(f"⟨lens.{key}⟩ belongs to ⟨+lens.gradient⟩ free")
-    if value_of(full["lens"], "lens.mirror") and "shift" not in full["screen"] and any(shift := _beside_the_light(full)):
-        said["screen"] = said.get("screen", {}) | {"shift": list(shift)}
-        full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
-        say.say(f"the screen is shifted by {shift[0]:g},{shift[1]:g} mm, beside the light of its source; ⟨+screen.shift⟩ places it")
-    settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
-    farther = full.get("second", {}).get("file")
-    second = None
-    if farther:
-        at = config.parent if config and "file" not in chosen.get("second", {}) else Path()
-        second = read_picture(at / farther, goal.get("encoding") == "linear", False, invert)
-        full["second"]["file"] = f"second{second.suffix}"
-    full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
-    if light is not None:
-        full["source"]["profile"] = f"profile{light.suffix}"
-    attachments.named_in_project(full)
-    project = Project(
-        out,
-        full,
-        picture,
-        light,
-        second,
-        uptodate.digest(full, picture, light, second),
-        without_waves=without_waves(full, "stages" in said.get("design", {})),
-    )
-    return _begun(project, said, force, recorded, say, device)
-
-
-def _begun(project: Project, said: Settings, force: bool, recorded: bool, say: Reporter, device: str) -> Begun:
-    """`begin` of a project whose settings are complete, `said` those that the user gave."""
-    out = project.path
+    project, said = new_project(target, given, preset, config, out, say.say)
     kind = kind_of(project.settings)
     if recorded and kind.no_movie:
         raise InputError(kind.no_movie)
@@ -203,7 +125,7 @@ def _begun(project: Project, said: Settings, force: bool, recorded: bool, say: R
         try:
             begun = first_heights(project, said, problem)
         except OutOfReach as error:
-            most = largest_magnification(problem.scene, project.settings["target"]["size"])
+            most = largest_magnification(problem.scene, project.settings.target.size)
             most = min(most or 0.0, TABLE["mag"].high)
             within = f"; ⟨+mag⟩ of at most about {at_most(most, 2)} is within reach at this throw" if most else ""
             raise InputError(f"{error}{within}") from error
@@ -212,39 +134,35 @@ def _begun(project: Project, said: Settings, force: bool, recorded: bool, say: R
     return begun
 
 
-def _beside_the_light(full: Settings) -> tuple[float, float]:
-    """Shift (x, y) mm of a mirror's screen with which it is nowhere in the light of its source; 0 if there is none."""
-    scene, over = settings.build_scene(full), Ranges.parse(value_of(full["design"], "design.over"))
-    return clear_shift([scene] if over is None else over.ends(scene)) or (0.0, 0.0)
-
-
-def first_heights(project: Project, said: Settings, problem: OneSurface) -> Begun:
+def first_heights(project: Project, said: Given, problem: OneSurface) -> Begun:
     """The initial heights of a design; and its project and problem with thickness and height range adapted to them, except for
     values `said` by the user.
 
     Raises:
         InputError: as of `begin`.
     """
-    fixed, project = "thickness" in said.get("lens", {}), replace(project, settings=copy.deepcopy(project.settings))
-    lens, built = project.settings["lens"], copy.deepcopy(project.settings["lens"])
-
-    def current() -> OneSurface:
-        """The problem, with the lens as adapted so far."""
-        nonlocal problem, built
-        if lens != built:
-            problem, built = problem_of(project, problem.device), copy.deepcopy(lens)
-        return problem
-
+    fixed = "thickness" in said.get("lens", {})
     first, middle = _solved(project, problem, fixed)
-    if problem.adapts and middle is not None:
-        lens["thickness"] = middle
-    if problem.adapts and first is not None:
-        if not fixed and (spare := _spare(lens, said, first)) > 0:
-            lens["thickness"] -= spare
-            first, middle = _solved(project, current(), fixed=True)[0], lens["thickness"]
-        if _make_room(project.settings, said, first) and middle is None:
-            first, _ = _solved(project, current(), fixed)
-    return Begun(project, current(), Designer(problem).initial_heights(first))
+    if not problem.adapts:
+        return Begun(project, problem, Designer(problem).initial_heights(first))
+    if middle is not None:
+        project, problem = _with_lens(project, problem, thickness=middle)
+    if first is not None and not fixed and (spare := _spare(project.settings.lens, said, first)) > 0:
+        middle = project.settings.lens.thickness - spare
+        project, problem = _with_lens(project, problem, thickness=middle)
+        first = _solved(project, problem, fixed=True)[0]
+    if first is not None and (room := _room(project.settings.lens, said, first)):
+        project, problem = _with_lens(project, problem, **room)
+        if middle is None:
+            first, _ = _solved(project, problem, fixed)
+    return Begun(project, problem, Designer(problem).initial_heights(first))
+
+
+def _with_lens(project: Project, problem: OneSurface, **values: Any) -> tuple[Project, OneSurface]:
+    """The project with other settings of its lens, and its problem."""
+    full = project.settings
+    project = replace(project, settings=full.changed(lens=full.lens.changed(**values)))
+    return project, problem_of(project, problem.device)
 
 
 @dataclass(frozen=True)
@@ -307,11 +225,11 @@ def _again(project: Project, device: str, say: Reporter, began: float, movie: No
 
 def _say_limits(project: Project, problem: OneSurface, first: InitialHeights | None, say: Reporter) -> None:
     """Report the limits set by diffraction and an extended source, and manufacturing figures of the initial surface."""
-    light, chosen = grey(project.picture.irradiance()), project.settings["design"]
+    light, chosen = grey(project.picture.irradiance()), project.settings.design
     if (ground := float((light >= NEARLY * light.max()).mean())) > GROUND and light.min() < 0.5 * light.max():
         say.say(f"{ground:.0%} of the picture are at its maximum: for a drawing on white, ⟨invert⟩ makes the lines bright")
-    size, timed = tuple(project.settings["target"]["size"]), math.isfinite(chosen["time_limit"])
-    for words in problem.notes(size, timed, project.without_waves if chosen["waves"] == "auto" else ""):
+    size, timed = project.settings.target.size, math.isfinite(chosen.time_limit)
+    for words in problem.notes(size, timed, project.without_waves if chosen.waves == "auto" else ""):
         say.say(words)
     heights = Designer(problem).begin().heights if first is None else first.heights
     nets = 3 if first is not None and first.unrounded is not None else 2
@@ -345,8 +263,8 @@ def resume(
         _refuse_edited(project, designer, state)
         state = designer.restored(state)
         if iterations is not None:
-            changed = project.settings["design"] | {"iterations": iterations}
-            project = replace(project, settings=project.settings | {"design": changed})
+            changed = project.settings.design.changed(iterations=iterations)
+            project = replace(project, settings=project.settings.changed(design=changed))
             project.write_settings()
         project = replace(project, asked=uptodate.asked_of(project, before) if begun else uptodate.begun(project))
         return _run(project, problem, state, say, began, time_limit, movie)
@@ -377,7 +295,7 @@ def follow(device: str) -> None:
         while task := ranks.receive():
             *parts, state, limit = task
             project = Project(None, *parts)
-            Designer(problem_of(project, device)).run(state, iterations=project.settings["design"]["iterations"], time_limit=limit)
+            Designer(problem_of(project, device)).run(state, iterations=project.settings.design["iterations"], time_limit=limit)
 
 
 def _on_cpu(state: State) -> State:
@@ -413,11 +331,11 @@ def _solved(project: Project, problem: OneSurface, fixed: bool) -> tuple[torch.T
     Raises:
         InputError: the project or surface cannot be read, its lens has another size, or the picture cannot be reached.
     """
-    start = project.settings["design"]["start"]
+    start = project.settings.design.start
     if start == "offset":
         return problem.offset(), None
     if start == "transport":
-        found = problem.transport(fixed, START_PART * project.settings["design"]["time_limit"])
+        found = problem.transport(fixed, START_PART * project.settings.design.time_limit)
         return found.heights, found.middle
     net = problem.field(0)
     if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
@@ -429,35 +347,33 @@ def _solved(project: Project, problem: OneSurface, fixed: bool) -> tuple[torch.T
         )
     other = Project.open(start)
     _, field, heights, _ = other.lens(other.scene())
-    if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
-        raise InputError(
-            f"⟨design.start⟩: the lens of {start} is {other.settings['lens']['size']} mm, not {project.settings['lens']['size']} mm"
-        )
+    sizes = [list(one.settings.lens.size) for one in (other, project)]
+    if sizes[0] != sizes[1]:
+        raise InputError(f"⟨design.start⟩: the lens of {start} is {sizes[0]} mm, not {sizes[1]} mm")
     return onto(field, heights, net), None
 
 
-def _spare(lens: dict[str, Any], said: Settings, first: torch.Tensor) -> float:
+def _spare(lens: LensSettings, said: Given, first: torch.Tensor) -> float:
     """Excess thickness of a plate below its initial surface beyond the wall, which may be given, mm; 0 for another lens."""
-    if max(lens["size"]) <= PLATE:
+    if max(lens.size) <= PLATE:
         return 0.0
-    wall = lens["min_thickness"] if "min_thickness" in said.get("lens", {}) else WALL
-    return max(0.0, float(first.min()) - lens["z_in"] - wall)
+    wall = lens.min_thickness if "min_thickness" in said.get("lens", {}) else WALL
+    return max(0.0, float(first.min()) - lens.z_in - wall)
 
 
-def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:
-    """Widen height_range and thickness as the initial surface requires, unless the user fixed them; True if they changed."""
-    lens = settings.build_lens(full)
+def _room(given: LensSettings, said: Given, first: torch.Tensor) -> dict[str, Any]:
+    """Height range and thickness as the initial surface requires, where it needs others and the user fixed none."""
+    lens = settings.build_lens(given)
     offset = HeightField.of(replace(lens, control=tuple(first.shape)))
     x, y = (c.numpy() for c in offset.control_xy())
     base = lens.offset.heights(x, y)
     departure = 2.0 * float(np.abs(first.numpy() - base).max())
     short = lens.z_in + lens.min_thickness - float(first.min())
-    fixed, changed = said.get("lens", {}), False
+    fixed, changed = said.get("lens", {}), dict[str, Any]()
     if departure > lens.height_range[1] and "height_range" not in fixed:
-        full["lens"]["height_range"], changed = [-departure, departure], True
+        changed["height_range"] = (-departure, departure)
     if short > 0 and "thickness" not in fixed:
-        full["lens"]["thickness"] += 1.5 * short + 0.02 * max(lens.size)
-        changed = True
+        changed["thickness"] = given.thickness + (1.5 * short + 0.02 * max(lens.size))
     return changed
 
 
@@ -466,9 +382,9 @@ class _Watch:
 
     def __init__(self, project: Project, designer: Designer, records: _Records, say: Reporter, movie: NoMovie):
         self.designer, self.records, self.say, self.movie = designer, records, say, movie
-        self.chosen, self.encoding = project.settings["design"], project.settings["target"]["encoding"]
+        self.chosen, self.encoding = project.settings.design, project.settings.target.encoding
         self.target = designer.problem.target.numpy()
-        self.total = self.chosen["iterations"] or sum(s.iterations for s in designer.stages)
+        self.total = self.chosen.iterations or sum(s.iterations for s in designer.stages)
         self.stage, self.saved = -1, time.monotonic()
         self.show: Callable[..., None] = lambda *progress: None
 
@@ -485,7 +401,7 @@ class _Watch:
 
     def keep_if_due(self, now: State) -> None:
         """Write a checkpoint if the last one is old enough."""
-        if time.monotonic() - self.saved >= max(self.chosen["checkpoint_every"], RARELY * (self.records.seconds - QUICK)):
+        if time.monotonic() - self.saved >= max(self.chosen.checkpoint_every, RARELY * (self.records.seconds - QUICK)):
             self.saved = time.monotonic()  # before writing, which takes time itself
             self.records.keep(now)
 
@@ -499,8 +415,8 @@ def _run(
     time_limit: float | None,
     movie: NoMovie = NO_MOVIE,
 ) -> Result:
-    chosen, designer = project.settings["design"], Designer(problem)
-    limit = chosen["time_limit"] if time_limit is None else time_limit
+    chosen, designer = project.settings.design, Designer(problem)
+    limit = chosen.time_limit if time_limit is None else time_limit
     timed = math.isfinite(limit)
     if timed:  # the limit includes the initial surface and the evaluation
         limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - expected_seconds(designer, state))
@@ -510,16 +426,16 @@ def _run(
     with _signals(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
             records.keep(state)
-            ranks.send((project.settings, project.picture, project.profile, project.second, _on_cpu(state), limit))
+            ranks.send((project.settings, project.picture, _on_cpu(state), limit))
             state = designer.run(
                 state,
-                iterations=chosen["iterations"],
+                iterations=chosen.iterations,
                 time_limit=limit,
                 stop=lambda: bool(asked),
                 on_iteration=watch,
                 notice=say.say,
             )
-            if not asked and not chosen["iterations"] and problem.options.parametrisation.free and state.reason in DONE:
+            if not asked and not chosen.iterations and problem.options.parametrisation.free and state.reason in DONE:
                 start, sharp = (None if z is None else rounded(z) for z in (state.start, state.unrounded))
                 state = replace(state, start=start, unrounded=sharp, parameters={}, optimizer={})
             if asked:
@@ -540,24 +456,24 @@ def _run(
         result = replace(result, figures=result.figures | movie.finish(shown, found.figures, say))
         if asked:
             raise Interrupted(f"interrupted after the design had ended; {project.path} is complete", 128 + asked[0])
-    if not timed and (words := problem.advice(tuple(project.settings["target"]["size"]))):
+    if not timed and (words := problem.advice(project.settings.target.size)):
         say.say(words)
     return result
 
 
 def _run_index(project: Project, problem: OneSurface, say: Reporter, began: float) -> Result:
     """Design a free gradient index, evaluate and save it."""
-    chosen, lens = project.settings["design"], project.settings["lens"]
+    chosen, lens = project.settings.design, project.settings.lens
     with _signals(project.path is not None) as asked:
         say.say(problem.words(lens))
-        with say.progress(chosen["iterations"] or problem.stages[-1].iterations) as show:
-            values, state = problem.iterate(lens, chosen["iterations"], began, chosen["time_limit"], lambda: bool(asked), show)
-        lens = lens | {"index_file": attachments.index_attached(values)}
-        project = replace(project, settings=project.settings | {"lens": lens})
+        with say.progress(chosen.iterations or problem.stages[-1].iterations) as show:
+            values, state = problem.iterate(lens, chosen.iterations, began, chosen.time_limit, lambda: bool(asked), show)
+        lens = lens.changed(index_file=attachments.index_attached(values))
+        project = replace(project, settings=project.settings.changed(lens=lens))
         if project.path is not None:
             project.write()
         designer = Designer(problem_of(project, problem.device))
-        found = evaluate_and_write(project, designer, state, math.isfinite(chosen["time_limit"]))
+        found = evaluate_and_write(project, designer, state, math.isfinite(chosen.time_limit))
         figures = {"index_least": float(np.min(values)), "index_most": float(np.max(values))}
         result = _finished(project, designer, found, figures, began, _Records(project, designer))
         if asked:
@@ -619,7 +535,7 @@ def provenance(project: Project, device: str) -> dict[str, Any]:
         "numpy": np.__version__,
         "device": device,
         "threads": torch.get_num_threads(),
-        "seed": project.settings["design"]["seed"],
+        "seed": project.settings.design.seed,
         "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
     }
 

@@ -35,10 +35,10 @@ BACKWARD = 2.5
 def evaluate_and_write(project: Project, designer: Designer, state: State, timed: bool = False) -> Evaluated:
     """Evaluate the finished lens; write render.png, wave.png and report.png into the project, if it has a directory."""
     target = designer.problem.target.numpy()
-    found = designer.problem.evaluate(designer, state, tuple(project.settings["target"]["size"]), timed)
+    found = designer.problem.evaluate(designer, state, project.settings.target.size, timed)
     if project.path is None:
         return found
-    encoding = project.settings["target"]["encoding"]
+    encoding = project.settings.target.encoding
     seen, aim = (irradiance(a, designer.scene.screen) for a in (found.image, target))
     made = uptodate.image_provenance(project, found.state.heights, found.figures)
     write_image(project.path / RENDER, seen, white_level(seen, aim), encoding, WIDE, made)

@@ -164,7 +164,7 @@ class Exporter:
             "keeps_picture": kept,
             "read_as": own.read_as,
             "samples": list(own.samples if file.chosen_by == "error" else readings[file.chosen_by]().samples),
-            "height_error_mm": own.largest_deviation(file.part.field, file.part.heights, file.part.lens.round),
+            "height_error_mm": own.largest_deviation(file.part.field, file.part.heights, file.part.lens.opening),
         }
         return found if kept else found | {"keep_it": [name for name in KEEPERS if name != format and self._keeps(name)]}
 
@@ -283,7 +283,7 @@ def exporter_of(project: Path, at: str | None, say: Reporter, most: float = MOST
     target = opened.target(scene)
     scene, field, heights, checkpoint = opened.lens(scene)
     waves = checkpoint.results.get("wave_relative_rms") is not None and checkpoint.results.get("error_by", "waves") == "waves"
-    return Exporter(scene, field, heights, target, waves, opened.settings["design"]["seed"], most, say), opened
+    return Exporter(scene, field, heights, target, waves, opened.settings.design.seed, most, say), opened
 
 
 #: How to have formats of splines exactly.
@@ -342,7 +342,7 @@ def files(path: Path, scene: Scene, format: str, script: bool = False) -> list[P
     if format == "heightmap":
         return [path, beside(path)]
     if format == "mitsuba":
-        return [path, *_home(format).companions(path, scene.lens.round, scene.lens.mirror, scene.two_sided, scene.elements)]
+        return [path, *_home(format).companions(path, scene)]
     return [path, *import_module("caustic_cli.export.lighttools_script").companions(path)] if script else [path]
 
 

@@ -30,9 +30,9 @@ def target_illumination(lens: Lens, picture: Path) -> np.ndarray:
         raise InputError("⟨want⟩ is for a project whose lens is an array of lenslets (caustic design with ⟨+lens.array⟩)")
     if scene.colored:
         raise InputError("⟨want⟩ is of brightness alone, and the project's picture has colours")
-    goal = project.settings["target"]
-    light = read_picture(picture, goal["encoding"] == "linear")
-    return target_on_screen(light.irradiance(), tuple(goal["size"]), scene.screen, goal["flip"])
+    goal = project.settings.target
+    light = read_picture(picture, goal.encoding == "linear")
+    return target_on_screen(light.irradiance(), goal.size, scene.screen, goal.flip)
 
 
 def solve_brightness(

@@ -16,15 +16,14 @@ from caustic_cli.config import checks, keywords
 from caustic_cli.errors import InputError
 from caustic_cli.export import format_of
 from caustic_cli.inverse.designer import State
-from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.plan import Plan, compile_plan, parse_effects
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.project import attachments, directory, uptodate
+from caustic_cli.project import directory, uptodate
+from caustic_cli.project.archived import ArchivedLens, origin_of
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
@@ -54,7 +53,7 @@ class Lens:
         heights: its control heights (n, m), mm, float64.
         target: (n_x, n_y) or (3, n_x, n_y) on the screen's pixels, None for an archive.
         figures: of the evaluation of the design with independent rays; empty for an unfinished design.
-        project: settings and picture, None for an archive.
+        origin: the project or the archive that it comes from.
         state: of the design; provenance: of that, see `workflow.design.provenance`.
     """
 
@@ -63,7 +62,7 @@ class Lens:
     heights: Tensor
     target: np.ndarray | None
     figures: dict[str, Any]
-    project: Project | None = None
+    origin: Project | ArchivedLens
     state: State | None = None
     provenance: dict[str, Any] | None = None
 
@@ -89,23 +88,15 @@ class Lens:
         return z, zx, zy
 
     @classmethod
-    def of(cls, project: Project, given: Mapping[str, Any] | None = None) -> Lens:
-        """The lens of the last checkpoint of a project, at its parameter values; given: path in `config.table` -> value, overriding
-        the settings of the project."""
-        scene = project.scene(dict(given or {}))
-        target = project.target(scene)
-        scene, field, heights, checkpoint = project.lens(scene)
-        return cls(scene, field, heights, target, dict(checkpoint.results), project, checkpoint.state, checkpoint.provenance)
+    def of(cls, origin: Project | ArchivedLens, given: Mapping[str, Any] | None = None) -> Lens:
+        """The lens of a project or an archive; given: path in `config.table` -> value, overriding the settings of a project."""
+        found = origin.read(given or {})
+        return cls(*found[:4], dict(found.figures), origin, *found[5:])
 
-    @classmethod
-    def of_archive(cls, path: str | Path, given: Mapping[str, Any] | None = None) -> Lens:
-        """The lens of an exported `.npz` archive; given: path in `config.table` -> value, which may be the `source.file` of its
-        rays only, if its source is a ray file."""
-        other, rays = dict(given or {}), None
-        if "source.file" in other and other.get("source.type", "rays") == "rays":
-            rays = attachments.rays_of(other.pop("source.file"))
-            other.pop("source.type", None)
-        return cls(*open_archive(path, rays), None, {}).under(other)
+    @property
+    def project(self) -> Project | None:
+        """Settings and picture, None for an archive."""
+        return self.origin if isinstance(self.origin, Project) else None
 
     def under(self, given: Mapping[str, Any]) -> Lens:
         """The lens in its scene with other settings of light or screen: path in `config.table` -> value.
@@ -115,28 +106,24 @@ class Lens:
         """
         if not given:
             return self
-        if self.project is None:
-            raise InputError(f"⟨{next(iter(given))}⟩: an archive's source is fixed; render its project under another light")
-        scene = self.project.scene(given)
+        scene = self.origin.scene(given)
         scene = replace(scene, lens=replace(scene.lens, entrance=self.scene.lens.entrance), elements=self.scene.elements)
-        return replace(self, scene=scene, target=self.project.target(scene))
+        return replace(self, scene=scene, target=self.origin.target(scene))
 
     @property
     def seed(self) -> int:
         """Seed of the rays of its design."""
-        return 0 if self.project is None else self.project.settings["design"]["seed"]
+        return self.origin.seed
 
     @property
     def by_waves(self) -> bool:
         """Whether its design was refined on its wave image, which then judges it."""
-        if self.project is None or self.state is None:
-            return False
-        return any(stage.get("waves") for stage in self.project.settings["design"]["stages"][: self.state.stage + 1])
+        return self.origin.refined_by_waves(self.state)
 
     @property
     def encoding(self) -> str:
         """Encoding of its picture, and of its images."""
-        return "srgb" if self.project is None else self.project.settings["target"]["encoding"]
+        return self.origin.encoding
 
     def plan(self, effects: str = "auto", steeper: float = 0.0) -> Plan:
         """The effects to simulate: those that the scene calls for ("auto"), only those that cannot be left out ("none"), or those
@@ -213,18 +200,12 @@ class Lens:
             self.field,
             self.heights.to(device),
             self.target,
-            self._resolution(plan.scene),
+            self.origin.resolution(plan.scene, self.field, self.heights),
             finer=1.0 if cut is None else FINER,
             required=required,
             perturbation=None if cut is None else height_deviation(cut, self.field, self.heights),
         )
         return Render(np.empty((0, 0)) if light is None else light.image.cpu().numpy(), judged(figures, True))
-
-    def _resolution(self, scene: Scene) -> Resolution:
-        """Resolution of the scene by diffraction."""
-        if self.project is None:
-            return Resolution.at(scene, self.field, self.heights)
-        return Resolution.before(scene, tuple(self.project.settings["target"]["size"]))
 
     def export(
         self,
@@ -254,10 +235,9 @@ class Lens:
 
     def save(self, path: str | Path, force: bool = False) -> Path:
         """Save the lens as a project directory, which `load` and the command line open; force: replace a project there."""
-        if self.project is None or self.state is None or self.provenance is None:
-            raise InputError("an archive's lens has no picture and no design, so it cannot be saved as a project")
         place = Path(path)
-        project = replace(self.project, path=place)
+        project = self.origin.moved(place)
+        assert self.state is not None and self.provenance is not None  # of every project
         directory.check(place, force)
         state = Checkpoint(self.state, self.field.spaces, self.provenance, self.figures, uptodate.inputs(project))
         directory.create(project, force, state)
@@ -275,26 +255,12 @@ def load(path: str | Path, at: str | None = None, **given: Any) -> Lens:
         InputError: there is none, it is damaged, a keyword is unknown, or a value is out of range.
     """
     other = _other_scene(given, ("at", *signature(Lens.render).parameters))
-    if is_archive(Path(path)):
-        refuse_at(at)
-        return Lens.of_archive(path, other)
-    return Lens.of(Project.open(path).at(at), other)
+    return Lens.of(origin_of(path, at), other)
 
 
 def _other_scene(given: Mapping[str, Any], own: Iterable[str]) -> dict[str, Any]:
     """Path -> value of keywords that change light or screen; own: names of the function's other parameters."""
     return keywords.checked(keywords.from_keywords("render", given, own), {}, "render")
-
-
-def refuse_at(at: str | None) -> None:
-    """Refuse parameter values of a network for an archive, which holds a single lens."""
-    if at is not None:
-        raise InputError(f"⟨at⟩ {at} needs a project, whose network gives a lens for every value; an archive holds one lens")
-
-
-def is_archive(path: Path) -> bool:
-    """Whether a path is an exported archive rather than a project."""
-    return path.suffix.lower() == ".npz" and path.is_file()
 
 
 def count(rays: float) -> int:

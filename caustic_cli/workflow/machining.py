@@ -14,7 +14,7 @@ from caustic_cli.io.gcode import read_program
 from caustic_cli.optics.envelope import Envelope
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Aperture, Scene
 
 #: Points at which the machined surface is compared with the design.
 POINTS = 400_000
@@ -45,8 +45,7 @@ def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float
         envelopes.append(Envelope(radius, *_near(centres, top + radius), top=top))
     if not envelopes:
         raise InputError(f"{path}: has no ball-nose tool, the only kind that is simulated")
-    mirror = scene.lens.mirror
-    turned = mirror if program.turned is None else program.turned
+    turned = scene.lens.cut_from < 0 if program.turned is None else program.turned
     zero = scene.lens.z_in if program.zero is None else program.zero
     return CutSurface(tuple(envelopes), field.half_size, -zero if turned else zero, turned)
 
@@ -58,9 +57,9 @@ def _near(centres: np.ndarray, top: float) -> tuple[np.ndarray, np.ndarray]:
     return (begin[cuts], end[cuts]) if cuts.any() else (centres[:1], centres[:1])
 
 
-def form_deviation(cut: CutSurface, field: HeightField, heights: Tensor, round: bool) -> dict:
-    """Form deviation of a machined surface, positive where material is left, for JSON: cut_left_mm and cut_gouge_mm, its extrema;
-    cut_rms_mm about the mean; cut_slope_rms and cut_slope_most, of its slope.
+def form_deviation(cut: CutSurface, field: HeightField, heights: Tensor, aperture: Aperture) -> dict:
+    """Form deviation of a machined surface within an aperture, positive where material is left, for JSON: cut_left_mm and
+    cut_gouge_mm, its extrema; cut_rms_mm about the mean; cut_slope_rms and cut_slope_most, of its slope.
 
     Raises:
         InputError: the program is for another part.
@@ -68,9 +67,8 @@ def form_deviation(cut: CutSurface, field: HeightField, heights: Tensor, round: 
     n = math.isqrt(POINTS)
     line = torch.linspace(-1.0, 1.0, n, dtype=torch.float64) * (1.0 - 1e-9)
     x, y = (c.reshape(-1) for c in torch.meshgrid(line * field.half_size[0], line * field.half_size[1], indexing="ij"))
-    if round:
-        inside = (x / field.half_size[0]) ** 2 + (y / field.half_size[1]) ** 2 <= 1.0
-        x, y = x[inside], y[inside]
+    inside = aperture.covers(x / field.half_size[0], y / field.half_size[1])
+    x, y = x[inside], y[inside]
     z, gx, gy = cut.at(None, x, y)
     nominal, hx, hy = field.at(heights, x, y)
     off = (z - nominal) * (-1.0 if cut.turned else 1.0)

@@ -60,11 +60,11 @@ def _lens_rows(lens: Lens) -> list[tuple[str, str]]:
     """Material, thickness and slopes of the lens within its aperture."""
     one, grid = lens.scene.lens, sample_grid(lens.field, lens.heights, (SAMPLES, SAMPLES))
     rx, ry = one.half_size
-    inside = (grid.x[:, None] / rx) ** 2 + (grid.y[None, :] / ry) ** 2 <= 1.0 if one.round else np.ones(grid.z.shape, dtype=bool)
+    inside = one.opening.covers(grid.x[:, None] / rx, grid.y[None, :] / ry)
     z, slope = grid.z[inside], np.hypot(grid.zx, grid.zy)[inside]
     depth = ("Depth of the surface", f"{z.max() - z.min():.4f} mm from its lowest to its highest point")
     steepest = ("Steepest slope", f"{slope.max():.4f}, {math.degrees(math.atan(slope.max())):.2f}°")
-    size = f"round, {_size(one.size[:1])} across" if one.round else _size(one.size)
+    size = f"round, {_size(one.size[:1])} across" if one.opening.round else _size(one.size)
     if one.mirror:
         return [("Mirror", f"{size}; the side towards the light reflects"), depth, steepest]
     return [
@@ -81,7 +81,7 @@ def _light_rows(scene: Scene) -> list[tuple[str, str]]:
     centre = "" if source.distant else f", its middle at {', '.join(f'{c:.6g}' for c in source.centre)} mm"
     return [
         ("Light", f"{source.kind}: {source.extent_words(scene.lens.z_in)}{centre}"),
-        ("Throw", f"{abs(screen.z):.6g} mm from the origin, on the {'mirror' if scene.lens.mirror else 'lens'}, to the screen"),
+        ("Throw", f"{abs(screen.z):.6g} mm from the origin, on the {scene.lens.kind}, to the screen"),
         ("Screen", f"{_size(screen.size)}, {_size(screen.resolution, '')} pixels"),
     ]
 

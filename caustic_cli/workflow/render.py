@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +22,8 @@ from caustic_cli.io.picture import WIDE, said_of, write_image, write_npy
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.plan import Plan, parse_effects
 from caustic_cli.optics.surfaces.cut import CutSurface
-from caustic_cli.project.project import FARTHER, RENDER, WAVE, Project, beside
+from caustic_cli.project.archived import origin_of
+from caustic_cli.project.project import FARTHER, WAVE, Project, beside
 from caustic_cli.project.uptodate import FILES, Outputs, image_provenance
 from caustic_cli.scene import Scene
 from caustic_cli.studies import effects as effects_study
@@ -35,7 +36,7 @@ from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
 from caustic_cli.workflow import page
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.illumination import solve_brightness, target_illumination
-from caustic_cli.workflow.lens import Lens, is_archive, refuse_at
+from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.machining import cut_surface, form_deviation
 from caustic_cli.workflow.reporter import Reporter
 from caustic_cli.workflow.tolerances import tolerances
@@ -151,13 +152,11 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         raise InputError(f"{asked.image}: ⟨out⟩ is a PNG, and its name must end in .png")
     for path in [path for path in (asked.image, asked.npy, asked.html) if path is not None]:
         destination(path)  # refuses what is no file name, before others are made of it
-    archived = Lens.of_archive(asked.lens, asked.given) if is_archive(asked.lens) else None
-    if archived is not None and asked.tolerances is not None:
+    origin = origin_of(asked.lens, asked.at)
+    project = origin if isinstance(origin, Project) else None
+    if project is None and asked.tolerances is not None:
         raise InputError("⟨tolerances⟩ compares with the picture, which an archive does not hold; render its project")
-    if archived:
-        refuse_at(asked.at)
-    project = None if archived else Project.open(asked.lens).at(asked.at)
-    image_path = asked.image or (asked.lens / RENDER if project else Path(asked.lens.stem + "-render.png"))
+    image_path = asked.image or origin.image
 
     def companion(name: str) -> Path:
         return image_path.with_name(name if asked.image is None else f"{image_path.stem}-{name}")
@@ -181,7 +180,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
             f"{image_path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it"
         )
         return figures
-    lens = archived or Lens.of(cast(Project, project), asked.given)
+    lens = Lens.of(origin, asked.given)
     if asked.screen_at is not None:
         lens = replace(lens, scene=replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at)))
     scene = lens.scene
@@ -194,7 +193,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     filter = filter_from(asked.reconstruction, asked.filter_size, scene.screen, asked.alpha)
     seed = lens.seed if asked.seed is None else asked.seed
     cut = None if asked.cut is None else cut_surface(asked.cut, scene, lens.field, asked.tool_radius)
-    deviation = {} if cut is None else form_deviation(cut, lens.field, lens.heights, scene.lens.round)
+    deviation = {} if cut is None else form_deviation(cut, lens.field, lens.heights, scene.lens.opening)
     plan = lens.plan(asked.effects, deviation.get("cut_slope_most", 0.0))
     if coarse := coarse_words(scene):
         say.say(coarse)
@@ -226,7 +225,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     else:
         write_image(image_path, shown, white_level(shown, aim), lens.encoding, wide, own)
     if scene.second is not None:
-        farther_target = None if lens.project is None else lens.project.second_target(scene)
+        farther_target = lens.origin.second_target(scene)
         with say.notify_if_slow("tracing the light behind the picture"):
             light, more = second_figures(
                 plan.scene,

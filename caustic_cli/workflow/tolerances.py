@@ -10,7 +10,7 @@ from torch import Tensor
 from caustic_cli.optics.plan import Plan
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.waves import wave_image
+from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
 from caustic_cli.studies import tolerances as study

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator
 from dataclasses import replace
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
+from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.io.picture import Picture
@@ -25,7 +25,7 @@ PARTS = (0.7, 1.0, 1.4, 2.0)
 LED, BEFORE, CONE, PIXELS = 2.0, 3.0, 90.0, 100
 
 
-def led() -> dict:
+def led() -> Settings:
     """Settings of the default scene of the study."""
     full = complete(
         {
@@ -34,27 +34,23 @@ def led() -> dict:
         },
         1.0,
     )
-    full["target"] |= {"file": "target.npy", "encoding": "linear"}
-    return full
+    return full.changed(target=full.target.changed(file="target.npy", encoding="linear"))
 
 
 def lenses(project: Project | None, seconds: float, device: str) -> tuple[int, Iterator[DesignedLens]]:
     """Largest number of lenses, and an iterator that designs them, each with at most `seconds` of iterations; those whose light
     cannot reach the picture are left out."""
     full = led() if project is None else project.settings
-    near = not settings.build_source(full).distant and not full["lens"].get("mirror", False)
+    near = not settings.build_source(full.source).distant and not full.lens.mirror
     weights, parts = (NEAR_WEIGHTS, PARTS) if near else (DISTANT_WEIGHTS, (1.0,))
     return len(weights) * len(parts), _designed(project, full, weights, parts, seconds, device)
 
 
-def _designed(project: Project | None, full: dict, weights, parts, seconds: float, device: str) -> Iterator[DesignedLens]:
+def _designed(project: Project | None, full: Settings, weights, parts, seconds: float, device: str) -> Iterator[DesignedLens]:
     for part in parts:
-        own = copy.deepcopy(full)
-        lens = own["lens"]
-        thickness = lens["z_in"] + part * (lens["thickness"] - lens["z_in"])
-        lens["thickness"] = thickness
-        own["design"]["waves"] = "off"
-        own["design"]["stages"] = [s for s in own["design"]["stages"] if not s.get("waves")]
+        thickness = full.lens.z_in + part * (full.lens.thickness - full.lens.z_in)
+        on_rays = [s for s in full.design.stages if not s.waves]
+        own = full.changed(lens=full.lens.changed(thickness=thickness), design=full.design.changed(waves="off", stages=on_rays))
         try:
             begun = _begun(project, own, device)
         except CausticError:
@@ -80,7 +76,7 @@ def _designed(project: Project | None, full: dict, weights, parts, seconds: floa
             )
 
 
-def _begun(project: Project | None, own: dict, device: str) -> Begun:
+def _begun(project: Project | None, own: Settings, device: str) -> Begun:
     """The design with these settings, adapted to its initial heights."""
     project = Project(None, own, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=own)
-    return first_heights(project, {"lens": {"thickness": own["lens"]["thickness"]}}, problem_of(project, device))
+    return first_heights(project, {"lens": {"thickness": own.lens.thickness}}, problem_of(project, device))

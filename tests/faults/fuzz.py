@@ -301,11 +301,13 @@ def kinds(folder: Path) -> list[Kind]:
         return open_archive(path), read_surface(path.rename(path.with_suffix(".npz")), half)
 
     def read_rays(path: Path) -> object:
-        found = attachments.attached({"file": str(path.rename(path.with_suffix(".ray")))})["file"].content
+        found = attachments.attached({"source": {"file": str(path.rename(path.with_suffix(".ray")))}})["source"]["file"].content
         return found.focus, found.nearest, found.spread
 
     def read_intensity(path: Path) -> object:
-        return attachments.attached({"intensity": str(path.rename(path.with_suffix(".csv")))})["intensity"].content.flux(1.0)
+        return attachments.attached({"source": {"intensity": str(path.rename(path.with_suffix(".csv")))}})["source"][
+            "intensity"
+        ].content.flux(1.0)
 
     step = _saved(lambda path: write_step(path, *lens))
     return [

@@ -362,7 +362,7 @@ def test_a_state_before_the_beginning(here, name):
 def test_a_line_without_end_in_a_table_of_intensities(tmp_path):
     path = tmp_path / "a.csv"
     path.write_bytes(b"1 " * (1 << 22))
-    assert "a.csv: line 1" in refused(lambda: attachments.attached({"intensity": str(path)}))
+    assert "a.csv: line 1" in refused(lambda: attachments.attached({"source": {"intensity": str(path)}}))
 
 
 # TOML

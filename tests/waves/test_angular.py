@@ -11,7 +11,7 @@ from angular import Relief, behind, binned, propagated
 from test_lenses import GREEN, LAMBDA, spline_of
 
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.waves import wave_image
+from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
 
 INDEX = 1.5

@@ -14,12 +14,12 @@ from test_lenses import GREEN, LAMBDA, flat, irradiance, scene_of, spline_of
 from caustic_cli.errors import CausticError
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.coherent import modes
+from caustic_cli.optics.spread import POINT
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import expose
-from caustic_cli.optics.waves import lines_of, wave_image
-from caustic_cli.optics.waves.image import Imager
-from caustic_cli.optics.waves.receiver import receiver_of
+from caustic_cli.optics.waves.image import Imager, lines_of, wave_image
+from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.scene import Disc, Light, PlaneWave, Points, Screen
 
 DOUBLE = torch.float64
@@ -127,7 +127,7 @@ def by_points(scene, field, heights, each: int):
     """The same by so many points of the source, each traced."""
     lines = lines_of(scene, field)
     imager = Imager.of(lines, {EXIT: heights}, receiver_of(lines[0].system, scene.screen))
-    imager = replace(imager, spread=None, each=24)
+    imager = replace(imager, spread=POINT, each=24)
     object.__setattr__(imager, "modes", lambda system: modes(system, each))
     return imager.expose(lines, {EXIT: heights})
 

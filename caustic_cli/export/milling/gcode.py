@@ -34,6 +34,7 @@ from caustic_cli.export.part import Part
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Aperture
 
 #: Tolerance of the path over the scallop height; digits of a coordinate beyond those of the tolerance; least number of digits.
 PATH_PART, MORE_DIGITS, LEAST_DIGITS = 0.01, 1, 4
@@ -122,18 +123,17 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     """
     if tolerance is not None:
         checks.number("⟨tolerance⟩", tolerance, 0.0, LENGTH, open_low=True)
-    m, lens, base = milling or Milling(), part.lens, part.lens.z_in
+    m, base = milling or Milling(), part.lens.z_in
     field, heights = part.field, part.heights - base  # from here on Z0 is the flat face
     low, high, slope, concave = shape_of(field, heights)
     step = m.step(concave, slope)
     over = min(MOST_OVER * m.tool_radius, m.tool_radius * slope / math.sqrt(1.0 + slope * slope) + step)
-    step = spacing(m.path, lens.half_size, over, step, lens.round)
+    outline = part.lens.opening.grown(over)
+    step = spacing(m.path, outline, step)
     scallop = m.scallop_of(step, concave, slope)
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
     digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance)) + MORE_DIGITS)
-    top = math.ceil((high + FACING) * 10.0) / 10.0 if m.stock is None else m.stock
-    if top < high:
-        raise InputError(f"⟨stock⟩ must reach the surface's highest point, {high:.6g} mm above Z0, got {top:g} mm")
+    top = _stock(m, high)
     dips = low - m.tool_radius + math.sqrt(m.tool_radius**2 - min(2.0 * over * over, 0.99 * m.tool_radius**2))
     if dips < 0.0:
         raise InputError(
@@ -141,8 +141,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
             " larger tool or finer scallops keep it above"
         )
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
-    shape = (lens.half_size, over, step, lens.round)
-    passes = spiral(*shape) if m.path == "spiral" else raster(*shape, lines[m.path])
+    passes = spiral(outline, step) if m.path == "spiral" else raster(outline, step, lines[m.path])
     with atomic_file(path) as file:
         out = _Writer(file, digits)
         out.say(*_head(part, m, step, scallop, top, digits, tolerance))
@@ -150,19 +149,10 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
         out.say(" " * COUNTED, "G21 G90 G17 G94")
         if m.roughing is not None:
             _begin(out, m.roughing_tool, m.rough_radius, m.spindle, safe)
-            _rough(out, m, field, heights, lens, top, low, safe)
+            _rough(out, m, field, heights, part.lens.opening, top, low, safe)
             out.say("M5", "M0 (change the tool)")
         _begin(out, "ball", m.tool_radius, m.spindle, safe)
-        offset, first = BallOffset(field, heights, m.tool_radius), True
-        move = min(
-            FIRST_MOVE * m.tool_radius, *(2.0 * r / (len(s.breaks) - 1) for s, r in zip(field.spaces, field.half_size, strict=True))
-        )
-        for line in _batches(passes, move):
-            points = with_heights(line, offset, move, tolerance)
-            if first:
-                _descend(out, points[0], top, m.plunge)
-                first = False
-            out.cut(points, m.feed)
+        _finish(out, m, field, heights, passes, top, tolerance)
         out.rapid(z=safe)
         out.say("M5", "M30")
         file.seek(place)
@@ -224,7 +214,32 @@ def _batches(passes: Iterator[np.ndarray], move: float) -> Iterator[np.ndarray]:
         yield np.concatenate(held)
 
 
-def _rough(out: _Writer, m: Milling, field: HeightField, heights: Tensor, lens, top: float, low: float, safe: float) -> None:
+def _stock(m: Milling, high: float) -> float:
+    """Height of the stock, mm, for a surface up to `high` mm."""
+    top = math.ceil((high + FACING) * 10.0) / 10.0 if m.stock is None else m.stock
+    if top < high:
+        raise InputError(f"⟨stock⟩ must reach the surface's highest point, {high:.6g} mm above Z0, got {top:g} mm")
+    return top
+
+
+def _finish(
+    out: _Writer, m: Milling, field: HeightField, heights: Tensor, passes: Iterator[np.ndarray], top: float, tolerance: float
+) -> None:
+    """Write the finishing passes, from the top of the stock on."""
+    offset, first = BallOffset(field, heights, m.tool_radius), True
+    spans = (2.0 * r / (len(s.breaks) - 1) for s, r in zip(field.spaces, field.half_size, strict=True))
+    move = min(FIRST_MOVE * m.tool_radius, *spans)
+    for line in _batches(passes, move):
+        points = with_heights(line, offset, move, tolerance)
+        if first:
+            _descend(out, points[0], top, m.plunge)
+            first = False
+        out.cut(points, m.feed)
+
+
+def _rough(
+    out: _Writer, m: Milling, field: HeightField, heights: Tensor, aperture: Aperture, top: float, low: float, safe: float
+) -> None:
     """Write layers from the top of the stock down to the allowance above the surface."""
     make, radius = {"ball": BallOffset, "flat": FlatOffset}[m.roughing_tool], m.rough_radius
     offset = make(field, heights, radius, m.allowance)
@@ -238,7 +253,7 @@ def _rough(out: _Writer, m: Milling, field: HeightField, heights: Tensor, lens, 
         def height(x: np.ndarray, y: np.ndarray, floor: float = floor) -> np.ndarray:
             return np.maximum(offset(x, y), floor)
 
-        for line in raster(lens.half_size, 0.5 * radius, ROUGH_STEP * radius, lens.round):
+        for line in raster(aperture.grown(0.5 * radius), ROUGH_STEP * radius):
             points = with_heights(line, height, FIRST_MOVE * radius, ROUGH_PART * m.allowance)
             kept = points[:, 2] < above  # elsewhere the material is removed already, or the surface reached
             for run in np.split(np.arange(len(points)), np.flatnonzero(np.diff(kept.astype(int))) + 1):

@@ -1,6 +1,6 @@
 """Tool paths: raster and spiral in the plane, and adaptive subdivision into linear moves within a tolerance of the height.
 
-Paths overrun the aperture by `over` mm on all sides, so that a ball reaches the contact points on sloped edges.
+Paths are those over the aperture with an overrun on all sides, so that a ball reaches the contact points on sloped edges.
 """
 
 from __future__ import annotations
@@ -8,8 +8,11 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
+from functools import singledispatch
 
 import numpy as np
+
+from caustic_cli.scene import Aperture, CircularAperture
 
 #: Largest deviation of the polygon from a spiral, over the step-over.
 OFF = 0.02
@@ -17,43 +20,53 @@ OFF = 0.02
 HALVINGS = 14
 
 
-def spacing(path: str, half_size: tuple[float, float], over: float, step: float, round: bool) -> float:
-    """Step-over, at most `step` mm, for a whole number of passes.  path: raster, raster-y or spiral."""
+def spacing(path: str, aperture: Aperture, step: float) -> float:
+    """Step-over, at most `step` mm, for a whole number of passes over an aperture.  path: raster, raster-y or spiral."""
     if path == "spiral":
-        reach = min(half_size) + over
-        return step if round else reach / math.ceil(reach / step)
-    across = 2.0 * (half_size[1 if path == "raster" else 0] + over)
+        return _turned(aperture, step)[0]
+    across = 2.0 * aperture.half_size[1 if path == "raster" else 0]
     return across / math.ceil(across / step)
 
 
-def raster(half_size: tuple[float, float], over: float, step: float, round: bool, along: int = 0) -> Iterator[np.ndarray]:
-    """Zigzag passes, at most `step` apart, each with the link to the next: points (k, 2) mm.  along: 0 for x, 1 for y.
+def raster(aperture: Aperture, step: float, along: int = 0) -> Iterator[np.ndarray]:
+    """Zigzag passes over an aperture, at most `step` apart, each with the link to the next: points (k, 2) mm.  along: 0 or 1, for x
+    or y.
 
     Each pass begins at the end point of the one before.
     """
-    across = half_size[1 - along] + over
+    across = aperture.half_size[1 - along]
     count = max(1, math.ceil(2.0 * across / step))
     lines = np.linspace(-across, across, count + 1)
-    if round:
-        lines = lines[1:-1] if count > 1 else lines[:1]
+    chords = [(at, aperture.chord(at, along)) for at in lines]
     last = None
-    for k, at in enumerate(lines):
-        reach = math.sqrt(max(0.0, across * across - at * at)) if round else half_size[along] + over
+    for k, (at, reach) in enumerate([chord for chord in chords if chord[1] > 0] or chords[:1]):  # others only touch the edge
         ends = np.array([[-reach, at], [reach, at]])[:: 1 if k % 2 == 0 else -1, :: 1 if along == 0 else -1]
         yield ends if last is None else np.concatenate([last[None], ends])
         last = ends[-1]
 
 
-def spiral(half_size: tuple[float, float], over: float, step: float, round: bool, turns: int = 8) -> Iterator[np.ndarray]:
+def spiral(aperture: Aperture, step: float, turns: int = 8) -> Iterator[np.ndarray]:
     """Spiral from the centre outwards, yielded in pieces of several turns: Archimedean, r = step t / (2 pi), or rectangular.
 
     On a rectangle's diagonals passes are 1.17 times as far apart as elsewhere.
     """
-    points = _circular(half_size[0] + over, step) if round else _rectangular([r + over for r in half_size], step)
-    piece = max(2, len(points) * turns * step / (max(half_size) + over))
+    points = _turned(aperture, step)[1]()
+    piece = max(2, len(points) * turns * step / max(aperture.half_size))
     edges = np.unique(np.linspace(0, len(points) - 1, math.ceil(len(points) / piece) + 1).astype(int))
     for first, last in itertools.pairwise(edges):
         yield points[first : last + 1]
+
+
+@singledispatch
+def _turned(aperture: Aperture, step: float) -> tuple[float, Callable[[], np.ndarray]]:
+    """Step-over of a spiral, at most `step` mm, and its points (k, 2) mm with the distance `step` of its turns."""
+    least = min(aperture.half_size)
+    return least / math.ceil(least / step), lambda: _rectangular(list(aperture.half_size), step)
+
+
+@_turned.register(CircularAperture)
+def _(aperture: CircularAperture, step: float) -> tuple[float, Callable[[], np.ndarray]]:
+    return step, lambda: _circular(aperture.radius, step)
 
 
 def _circular(radius: float, step: float) -> np.ndarray:

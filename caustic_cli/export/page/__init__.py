@@ -33,7 +33,7 @@ from caustic_cli.io.files import CREATED_BY, write_bytes
 from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene, Screen, Source
+from caustic_cli.scene import Lens, Scene, Screen, Source
 
 #: Cells of the grid along its longer side, the finest that fits is used; multiples of COARSEST, by which the page subsamples it.
 CELLS = (1024, 768, 512, 384)
@@ -116,31 +116,16 @@ def write_page(
         InputError: as in `refuse_untraceable`, or the file cannot be written.
     """
     refuse_untraceable(scene)
-    screen = _coarser(scene.screen)
-    lens = scene.lens
+    screen, kind = _coarser(scene.screen), scene.lens.kind
     data = {
         "title": title,
-        "lens": {
-            "size": list(lens.size),
-            "zIn": lens.z_in,
-            "round": lens.round,
-            "mirror": lens.mirror,
-            "fresnel": ["none", "schlick", "exact"].index("none" if lens.mirror else lens.fresnel),
-            "absorption": 0.0 if lens.mirror else lens.absorption,
-        },
-        "screen": {
-            "z": screen.z,
-            "low": list(screen.low),
-            "pixel": list(screen.pixel),
-            "resolution": list(screen.resolution),
-            "axes": [list(axis) for axis in screen.axes],
-        },
+        "lens": _lens(scene.lens),
+        "screen": _screen(screen),
         "lights": _lights(scene),
         "encoding": encoding,
         "target": None if target is None else _coded(_onto(target, screen)),
         "waves": None if waves is None else _coded(_onto(waves, screen)),
     }
-    kind = "mirror" if lens.mirror else "lens"
     words = {
         "title": html.escape(title),
         "kind": kind,
@@ -155,6 +140,29 @@ def write_page(
     page = _assembled(words, data | {"cloud": cloud}).encode()
     assert len(page) <= MOST, len(page)
     write_bytes(path, page)
+
+
+def _lens(lens: Lens) -> dict:
+    """What the page needs of a lens or mirror beside its surface."""
+    return {
+        "size": list(lens.size),
+        "zIn": lens.z_in,
+        "round": lens.opening.round,
+        "mirror": lens.mirror,
+        "fresnel": ["none", "schlick", "exact"].index(lens.interior.fresnel),
+        "absorption": lens.interior.absorption,
+    }
+
+
+def _screen(screen: Screen) -> dict:
+    """The screen, with its lowest corner and its axes."""
+    return {
+        "z": screen.z,
+        "low": list(screen.low),
+        "pixel": list(screen.pixel),
+        "resolution": list(screen.resolution),
+        "axes": [list(axis) for axis in screen.axes],
+    }
 
 
 def _assembled(words: dict[str, str], data: dict) -> str:
@@ -245,7 +253,7 @@ def _source(scene: Scene, source: Source) -> dict:
     if len(places) > PLACES:
         kept = np.linspace(0, len(places) - 1, PLACES).round().astype(int)
         places, parts = places[kept], parts[kept] / parts[kept].sum()
-    cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
+    cone = source.cone_over(lens.pupil)
     angles = 2.0 * np.arcsin(np.linspace(0.0, 1.0, ANGLES) * math.sin(0.5 * cone))
     return {
         "near": True,

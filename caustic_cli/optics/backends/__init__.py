@@ -19,16 +19,21 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import import_module
 
 import torch
+from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.scene import Screen
 
 #: Name -> module and class, imported on demand: surfaces and backends refer to each other, and numba is slow to load.
 BACKENDS = {"torch": ("reference", "Torch"), "numba": ("cpu", "Numba"), "cuda": ("cuda", "Cuda")}
+#: A fused kernel: heights, upright screen and filter -> image, power behind the surface, and losses there.
+Fused = Callable[[Tensor, Screen, Filter], tuple[Tensor, Tensor, dict]]
 #: Accepted values of CAUSTIC_KERNELS.
 KERNELS = ("", "torch", "cuda")
 

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics import intersection
-from caustic_cli.optics.backends.reference import Torch, by_mesh
+from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.gradient.fields import LEAST_SQUARE, SplineIndex
-from caustic_cli.optics.gradient.integrator import ORDER, WEIGHTS, Flow
+from caustic_cli.optics.gradient.integrator import WEIGHTS, Flow
 from caustic_cli.optics.interface import OutgoingRays
-from caustic_cli.optics.kernels import fused_functions
+from caustic_cli.optics.kernels import fused, fused_functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
 from caustic_cli.optics.kernels.polynomial_index import formula_flow
@@ -42,6 +42,18 @@ class Numba(Torch):
     def compile_plane(self) -> None:
         """Load the kernels for plane waves from the cache, or compile them."""
         fused_functions.compile_kernels()
+
+    def compile_part(self, name: str) -> None:
+        """Compile the part of them with that name: splat, adjoint or surface."""
+        {
+            "splat": fused_functions.compile_splat,
+            "adjoint": fused_functions.compile_adjoint,
+            "surface": fused_functions.compile_surface,
+        }[name]()
+
+    def cache_path(self) -> str | None:
+        """Directory of the compiled kernels for plane waves; None if nothing can be cached."""
+        return fused.backward.stats.cache_path
 
     def precision(self, dtype: torch.dtype) -> torch.dtype:
         """float64."""
@@ -91,7 +103,7 @@ class Numba(Torch):
 
         return intersect
 
-    def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
+    def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int) -> Flow:
         """As the reference; B-spline volumes and polynomial fields by kernels."""
         if time.numel() and field.formula is not None:
             terms, axial, squared = field.formula
@@ -107,7 +119,7 @@ class Numba(Torch):
         self, field, heights: Tensor, origin, direction, method: intersection.Method, radius: float | None
     ) -> tuple[Tensor, Tensor]:
         """As the reference."""
-        start, found = by_mesh(field, heights, origin, direction, method, radius)
+        start, found = method.start(field, heights, origin, direction, radius)
         if found is not None:
             return found
         hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, radius)

@@ -12,7 +12,7 @@ from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.interface import OutgoingRays
 from caustic_cli.optics.kernels.cuda import rays as by_ray
 from caustic_cli.optics.kernels.cuda import sums
-from caustic_cli.optics.kernels.cuda.image import Light, expose
+from caustic_cli.optics.kernels.cuda.image import LitRays, expose
 from caustic_cli.optics.kernels.cuda.splat import splat_rays
 from caustic_cli.optics.kernels.cuda.surface import hits_of_rays, surface_at, surface_of
 from caustic_cli.optics.rays import RayState
@@ -77,13 +77,13 @@ class Cuda(Torch):
         """As the reference."""
         return splat_rays(x, y, weight, screen, filter)
 
-    def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None) -> PlaneImage:
+    def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like) -> CudaPlaneImage:
         """The fused kernel for rays of a plane wave on a B-spline: a function of heights, screen and filter."""
-        return PlaneImage(field, rays, eta, fresnel)
+        return CudaPlaneImage(field, rays, eta, fresnel)
 
-    def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
+    def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like) -> CudaRayImage:
         """The fused kernel for arbitrary rays below a B-spline."""
-        return RayImage(field, rays, eta, fresnel, radius)
+        return CudaRayImage(field, rays, eta, fresnel, radius)
 
 
 def _points(sample: Sample) -> tuple[Tensor, Tensor]:
@@ -93,7 +93,7 @@ def _points(sample: Sample) -> tuple[Tensor, Tensor]:
     return u, v
 
 
-class PlaneImage:
+class CudaPlaneImage:
     """See `Cuda.plane_image`."""
 
     def __init__(self, field, rays: RayState, eta: float, fresnel: str):
@@ -103,7 +103,7 @@ class PlaneImage:
         (rx, ry), none = field.half_size, self.u[:0]
         power = rays.power.double().expand(sample.shape).reshape(-1).contiguous()
         self.surface, self.interface = surface_of(field, self.u.device), (eta, fresnel)
-        self.light = Light((2.0 * self.u - 1.0) * rx, (2.0 * self.v - 1.0) * ry, (none, none), power, False)
+        self.light = LitRays((2.0 * self.u - 1.0) * rx, (2.0 * self.v - 1.0) * ry, (none, none), power, False)
         self.unit = sums.unit_of(power.abs().sum())
 
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
@@ -114,14 +114,14 @@ class PlaneImage:
         return expose(sag, self.light, self.unit, place, *self.interface, screen, filter)
 
 
-class RayImage:
+class CudaRayImage:
     """See `Cuda.ray_image`."""
 
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None):
         x, y, *direction = (c.double().contiguous() for c in rays.full((*rays.origin[:2], *rays.direction)))
         self.surface, self.interface, self.radius = surface_of(field, x.device), (eta, fresnel), radius
         self.z, self.direction, power = rays.origin[2] + rays.datum, direction, rays.power.double().contiguous()
-        self.light = Light(x, y, (direction[0], direction[1]), power, True)
+        self.light = LitRays(x, y, (direction[0], direction[1]), power, True)
         self.unit = sums.unit_of(power.abs().sum())
 
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:

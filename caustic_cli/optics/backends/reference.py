@@ -1,26 +1,25 @@
-"""The reference backend: every stage of a trace in plain torch, for any device."""
+"""The reference backend: every stage of a trace in plain torch, for any device.
+
+Stages of optional capabilities are in modules of their own, loaded when they are called.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics import intersection, reintersection
-from caustic_cli.optics.gradient.integrator import ORDER, Flow, flow
+from caustic_cli.optics import intersection
+from caustic_cli.optics.backends import Fused
 from caustic_cli.optics.interface import OutgoingRays, interact
-from caustic_cli.optics.mesh import TriangleMesh
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sample, scattered_points
 from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Screen
-
-#: A fused kernel: heights, screen and filter -> image, power behind the surface, and losses there.
-Fused = Callable[[Tensor, Screen, Filter], tuple[Tensor, Tensor, dict]]
 
 
 class Torch:
@@ -65,7 +64,7 @@ class Torch:
         self, field, heights: Tensor, origin, direction, method: intersection.Method, radius: float | None
     ) -> tuple[Tensor, Tensor]:
         """`intersection.find`."""
-        start, found = by_mesh(field, heights, origin, direction, method, radius)
+        start, found = method.start(field, heights, origin, direction, radius)
         if found is not None:
             return found
         if start is not None:
@@ -78,6 +77,7 @@ class Torch:
 
     def next_intersections(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
         """Distances (N,) mm to the next intersection of rays that start on a B-spline, 0 for none: see `reintersection`."""
+        reintersection = import_module("caustic_cli.optics.reintersection")
         return reintersection.reference(field, heights, origin, direction, below, round, step)
 
     def interact(
@@ -86,9 +86,10 @@ class Torch:
         """Refraction or reflection: `interface.interact`."""
         return interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side)
 
-    def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
+    def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int):
         """Rays in a gradient-index medium: `integrator.flow`."""
-        return flow(field, coefficients, point, momentum, time, steps, order)
+        integrator = import_module("caustic_cli.optics.gradient.integrator")
+        return integrator.flow(field, coefficients, point, momentum, time, steps, order)
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """Ray transfer to a plane.
@@ -122,20 +123,6 @@ class Torch:
     def ray_image(self, *_: Any, **__: Any) -> Fused | None:
         """No fused kernel for other rays."""
         return None
-
-
-def by_mesh(field, heights, origin, direction, method: intersection.Method, radius):
-    """Distances to the intersections with the mesh (None if not requested), and (t, status) if the mesh is the whole method."""
-    if method.name == "newton":
-        return None, None
-    mesh = TriangleMesh(field, heights, *method.parts)
-    rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
-    ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*rays)
-    start, missed, _ = mesh.intersect(ox, oy, oz, dx, dy, dz, method.recursive)
-    if method.name == "mesh":
-        t = torch.where(missed == 0, start, torch.zeros_like(start))
-        return start, (t, intersection.within(missed.long(), start, origin, direction, radius))
-    return start, None
 
 
 def _dot(a, b):

@@ -1,46 +1,59 @@
-"""Physical effects, one file each; listed in the order in which they act on the light."""
+"""Physical effects, one file each; listed in the order in which they act on the light.
+
+An effect is loaded when it is asked for: all of them by a plan, those that act on the rays of a system by its trace.
+"""
 
 from __future__ import annotations
 
-from caustic_cli.optics.effects.absorption import Absorption
-from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Decision, Effect, Probe, Requests
-from caustic_cli.optics.effects.diffraction import Diffraction
-from caustic_cli.optics.effects.dispersion import Dispersion
-from caustic_cli.optics.effects.entrance import Entrance
-from caustic_cli.optics.effects.fresnel import Fresnel
-from caustic_cli.optics.effects.ghosts import Ghosts
-from caustic_cli.optics.effects.gradient_index import GradientIndex
-from caustic_cli.optics.effects.intersection import Intersection
-from caustic_cli.optics.effects.mirror import Mirror
-from caustic_cli.optics.effects.missed_surface import MissedSurface
-from caustic_cli.optics.effects.polarisation import Polarisation
-from caustic_cli.optics.effects.roughness import Roughness
-from caustic_cli.optics.effects.screen_shape import ScreenShape
-from caustic_cli.optics.effects.screen_shift import ScreenShift
-from caustic_cli.optics.effects.screen_tilt import ScreenTilt
-from caustic_cli.optics.effects.secondary_intersection import SecondaryIntersection
-from caustic_cli.optics.effects.source_size import SourceSize
-from caustic_cli.optics.effects.total_reflection import TotalReflection
+from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
 
-EFFECTS: tuple[Effect, ...] = (
-    SourceSize(),
-    Polarisation(),
-    Dispersion(),
-    Entrance(),
-    GradientIndex(),
-    Intersection(),
-    MissedSurface(),
-    Absorption(),
-    Roughness(),
-    Fresnel(),
-    TotalReflection(),
-    Mirror(),
-    SecondaryIntersection(),
-    Ghosts(),
-    ScreenShape(),
-    ScreenTilt(),
-    ScreenShift(),
-    Diffraction(),
-)
+from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Decision, Effect, Probe, Requests
+from caustic_cli.optics.system import System
 
 __all__ = ["EFFECTS", "NEGLIGIBLE", "NO_REQUESTS", "Action", "Decision", "Effect", "Probe", "Requests"]
+
+
+class Effects:
+    """All effects, in order.  An effect's name with underscores is that of its module, and in capitals that of its class."""
+
+    names = (
+        "source-size",
+        "polarisation",
+        "dispersion",
+        "entrance",
+        "gradient-index",
+        "intersection",
+        "missed-surface",
+        "absorption",
+        "roughness",
+        "fresnel",
+        "total-reflection",
+        "mirror",
+        "secondary-intersection",
+        "ghosts",
+        "screen-shape",
+        "screen-tilt",
+        "screen-shift",
+        "diffraction",
+    )
+
+    def __iter__(self) -> Iterator[Effect]:
+        return map(self.__getitem__, self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @cache  # noqa: B019  there is one registry
+    def __getitem__(self, name: str) -> Effect:
+        module = import_module(f"{__name__}.{name.replace('-', '_')}")
+        return getattr(module, name.title().replace("-", ""))()
+
+    def acting(self, system: System, requests: Requests) -> list[Effect]:
+        """Those that a system asks for, or that are requested or omitted by request: no other acts on its rays."""
+        named = system.effects | requests.on | requests.off
+        return [self[name] for name in self.names if name in named]
+
+
+EFFECTS = Effects()

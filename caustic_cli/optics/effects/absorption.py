@@ -18,10 +18,11 @@ class Absorption(Effect):
     """Without it the glass is perfectly transparent."""
 
     name = "absorption"
+    of_glass = True
 
     def decide(self, scene: Scene, bounds) -> Decision:
         """Needed if a coefficient is above 0."""
-        a = 0.0 if scene.lens.mirror else max(scene.lens.absorption, *(e.absorption for e in scene.elements), 0.0)
+        a = max(scene.lens.interior.absorption, *(e.absorption for e in scene.elements), 0.0)
         why = f"the glass absorbs {a:g} per mm" if a > 0 else "the glass is clear"
         return Decision(self.name, a > 0, why, a, 0.0, present=a > 0)
 
@@ -34,13 +35,11 @@ class Absorption(Effect):
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """Weak absorption."""
-        if scene.lens.mirror:
-            return None
         return Probe(replace(scene, lens=replace(scene.lens, absorption=AMOUNT)), None, f"{AMOUNT:g} per mm")
 
-    def action(self, system, requests: Requests) -> Action | None:
-        """The action, if a medium absorbs."""
-        return AbsorptionAction() if any(medium.absorption for medium in system.media()) else None
+    def action(self, system, requests: Requests) -> Action:
+        """The attenuation."""
+        return AbsorptionAction()
 
 
 class AbsorptionAction(Action):
@@ -50,5 +49,5 @@ class AbsorptionAction(Action):
         """Attenuate by the factor exp(-a length)."""
         if m.absorption:
             before = m.state.power
-            m.state.power = before * torch.exp(-m.absorption * torch.as_tensor(m.length))  # 0.0 for rays on the pupil already
+            m.state.power = before * torch.exp(-m.absorption * torch.as_tensor(m.hit.length))  # 0.0 for rays on the pupil already
             m.state.lose("absorbed", (before - m.state.power).detach())

@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from caustic_cli.optics.bounds import Bounds
 from caustic_cli.optics.interaction import Interaction, Parameters, RayTracer
 from caustic_cli.optics.rays import RayState
-from caustic_cli.optics.surfaces import SurfaceIntersection
+from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Scene
+
+if TYPE_CHECKING:  # a trace takes no bounds, and does not load them
+    from caustic_cli.optics.bounds import Bounds
 
 #: Fraction of the source's power below which stray light is neglected: the models of other effects are no more accurate.
 NEGLIGIBLE = 0.01
@@ -102,10 +105,12 @@ class Effect(ABC):
     free = False
     #: Whether it affects the wave image only.
     waves = False
+    #: Whether it is one of glass, which a mirror does not have.
+    of_glass = False
 
     @abstractmethod
     def decide(self, scene: Scene, bounds: Bounds) -> Decision:
-        """Whether a scene needs the effect, and why."""
+        """Whether a scene needs the effect, and why; not asked where its lens or mirror lacks it."""
 
     def without(self, scene: Scene) -> Scene:
         """The scene without the effect."""

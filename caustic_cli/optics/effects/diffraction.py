@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from caustic_cli.optics.effects.base import Decision, Effect
 from caustic_cli.optics.resolution import WIDENED
+from caustic_cli.optics.waves.unsupported import limit_of
 from caustic_cli.scene import Scene
 
 
@@ -19,15 +20,8 @@ class Diffraction(Effect):
     def decide(self, scene: Scene, bounds) -> Decision:
         """Needed if it increases the blur of source and pixel noticeably."""
         r = bounds.resolution
-        if scene.source.rays is not None:
-            return Decision(self.name, False, "a ray file contains no phase", r.widened, WIDENED)
-        if scene.screen.curved:
-            return Decision(self.name, False, "a curved screen has no wave image", r.widened, WIDENED)
-        if scene.lens.gradient is not None:
-            why = "wave images are implemented for homogeneous lenses only"
-            return Decision(self.name, False, why, r.widened, WIDENED, fixed=True)
-        if scene.elements:
-            return Decision(self.name, False, "wave images are implemented for a single lens only", r.widened, WIDENED, fixed=True)
+        if limit := limit_of(scene):
+            return Decision(self.name, False, limit.why, r.widened, WIDENED, fixed=limit.fixed)
         light = f"{r.wavelength:.4g} nm" if r.said else f"{r.wavelength:g} nm, as the scene says no wavelength,"
         why = f"light of {light} blurs over {r.diffraction:.2g} mm, the source over {r.source:.2g} mm, a pixel is {r.pixel:.2g} mm"
         return Decision(self.name, r.matters, why, r.widened, WIDENED)

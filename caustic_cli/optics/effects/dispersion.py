@@ -18,6 +18,7 @@ class Dispersion(Effect):
     """Without it the index is the same at all wavelengths."""
 
     name = "dispersion"
+    of_glass = True
 
     def decide(self, scene: Scene, bounds) -> Decision:
         """Needed if several wavelengths pass a glass."""
@@ -29,13 +30,7 @@ class Dispersion(Effect):
                 f" {max(indices):.5f}"
             )
             return Decision(self.name, True, why, max(indices) - min(indices), 0.0)
-        why = (
-            "one wavelength"
-            if not scene.light.wavelengths
-            else "a mirror treats all wavelengths alike"
-            if scene.lens.mirror
-            else "the lens' index is the same at all wavelengths"
-        )
+        why = scene.lens.interaction.achromatic if scene.light.wavelengths else "one wavelength"
         return Decision(self.name, False, why, 0.0, 0.0, present=False)
 
     def without(self, scene: Scene) -> Scene:
@@ -48,8 +43,6 @@ class Dispersion(Effect):
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """Three spectral lines in the lens' glass, or in a common one."""
-        if scene.lens.mirror:
-            return None
         glass = scene.lens.glass or GLASS
         lens = replace(scene.lens, glass=glass, index=refractive_index(glass))
         dispersed = replace(scene, lens=lens, light=Light(scene.light.polarisation, LINES))

@@ -38,4 +38,4 @@ class NoRefraction(Action):
     def after_interaction(self, m) -> None:
         """Restore the incident directions."""
         if m.index == 0 and m.forward:
-            m.state.direction = rotate_to_global(m.element.pose, m.incoming)
+            m.state.direction = rotate_to_global(m.element.pose, m.hit.incoming)

@@ -15,8 +15,6 @@ class Fresnel(Effect):
 
     def decide(self, scene: Scene, b) -> Decision:
         """Needed unless the scene has fresnel = none."""
-        if scene.lens.mirror:
-            return Decision(self.name, False, "mirrors have a reflectance of 1", present=False)
         if scene.lens.fresnel == "none":
             return Decision(self.name, False, "fresnel = none: perfectly coated", 0.0, 0.0)
         normal = ((b.index - 1.0) / (b.index + 1.0)) ** 2

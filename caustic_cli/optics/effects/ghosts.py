@@ -25,8 +25,6 @@ class Ghosts(Effect):
     def decide(self, scene: Scene, b) -> Decision:
         """By a bound of the power that is reflected twice, and by an estimate of its contribution to the image, where it may
         focus."""
-        if scene.lens.mirror:
-            return Decision(self.name, False, "there is no glass", present=False)
         amount = max(b.ghost, b.ghost_error)
         if amount <= NEGLIGIBLE:
             why = f"at most {b.ghost:.2%} of the power is reflected twice, which changes the image by about {b.ghost_error:.1g}"
@@ -38,7 +36,7 @@ class Ghosts(Effect):
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
         """A request to trace them."""
-        return Requests.to(self.name) if on and not scene.lens.mirror else NO_REQUESTS
+        return Requests.to(self.name) if on else NO_REQUESTS
 
     def action(self, system, requests: Requests) -> Action | None:
         """The action, if requested and if there are two refracting elements."""
@@ -55,9 +53,9 @@ class DoubleReflections(Action):
         found, elements = [], tracer.system.elements
         heights = [parameters.get(e.name) for e in elements]
         for j, m in enumerate(interactions):
-            if m.reflects or not bool((m.power_in > m.power_out).any()):
+            if m.reflects or not bool((m.power_in > m.out.power).any()):
                 continue
-            totally = ~m.passes
+            totally = ~m.out.passes
             for i in range(j - 1, -1, -1):
                 if elements[i].reflects:  # ghosts between elements separated by a mirror are not traced
                     break

@@ -22,6 +22,7 @@ class GradientIndex(Effect):
     """Without it the lens is homogeneous."""
 
     name = "gradient-index"
+    of_glass = True
 
     def decide(self, scene: Scene, bounds) -> Decision:
         """By a bound of the displacement on the screen due to the curvature of rays and to the deviation of the index.
@@ -34,7 +35,7 @@ class GradientIndex(Effect):
         least, most, steepest = field.extremes(lens.half_size, bounds.depth)
         turn = min(steepest * bounds.depth * most / least, 0.5 * math.pi)
         moved = turn * (bounds.depth / (2.0 * least) + scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
-        step = (max(most - lens.index, lens.index - least) / lens.index) * bounds.slope
+        step = (max(most - lens.index, lens.index - least) / lens.index) * bounds.exit.slope
         moved += step * (scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
         why = (
             f"the index goes from {least:.5g} to {most:.5g}, by up to {steepest:.3g} per mm, which moves light by up to"
@@ -49,8 +50,6 @@ class GradientIndex(Effect):
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """A weak radial gradient with the index decreasing towards the edge."""
         lens = scene.lens
-        if lens.mirror:
-            return None
         depth, edge = lens.offset.thickness - lens.z_in, min(lens.half_size)
         if not depth > 0:
             return None

@@ -32,6 +32,9 @@ class Intersection(GeneralRayEffect):
 class MeanPlane(Action):
     """The approximation by the plane of mean height: the surface's height and slopes at the intersection with that plane."""
 
+    #: Height of the points above the mean plane, mm, of rays that have just met it.
+    _lift: Tensor | None = None
+
     def intersect(self, m, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
         """Intersect the mean plane; the ray continues from the surface's height there, without additional path length."""
         surface = m.element.surface
@@ -44,12 +47,12 @@ class MeanPlane(Action):
         (rx, ry) = surface.half_size
         found = (x.abs() <= rx) & (y.abs() <= ry)
         z, gx, gy = surface.evaluate(sag, x.detach().clamp(-rx, rx), y.detach().clamp(-ry, ry))
-        m.lift = torch.where(found, z, torch.zeros_like(z))
+        self._lift = torch.where(found, z, torch.zeros_like(z))
         t = torch.where(found, t, torch.zeros_like(t))
         return SurfaceIntersection(t, gx, gy, found)
 
     def before_interaction(self, m) -> None:
         """Shift the points from the mean plane to the surface."""
-        if m.lift is not None:
+        if self._lift is not None:
             x, y, z = m.state.origin
-            m.state.origin = (x, y, z + m.lift)
+            m.state.origin, self._lift = (x, y, z + self._lift), None

@@ -16,13 +16,14 @@ class MissedSurface(Effect):
 
     def decide(self, scene: Scene, b) -> Decision:
         """By the bound of the rays' distance from the axis at the surface's greatest height."""
+        reach = b.exit.reach
         if scene.elements:
             return Decision(self.name, True, "the apertures of other elements may stop light", fixed=True)
         if scene.axial:
-            return Decision(self.name, False, "every ray of a plane wave is on the surface", b.reach, 1.0)
-        if b.reach <= 1.0:
-            return Decision(self.name, False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)
-        if math.isinf(b.reach):
+            return Decision(self.name, False, "every ray of a plane wave is on the surface", reach, 1.0)
+        if reach <= 1.0:
+            return Decision(self.name, False, f"no ray gets beyond {reach:.4g} of the aperture's half width", reach, 1.0)
+        if math.isinf(reach):
             return Decision(self.name, True, "the surface may dip below the entrance", None, 1.0, fixed=True)
-        why = f"rays may get to {b.reach:.4g} of the aperture's half width, where its edge absorbs them"
-        return Decision(self.name, True, why, b.reach, 1.0, fixed=True)
+        why = f"rays may get to {reach:.4g} of the aperture's half width, where its edge absorbs them"
+        return Decision(self.name, True, why, reach, 1.0, fixed=True)

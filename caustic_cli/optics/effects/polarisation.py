@@ -19,13 +19,13 @@ class Polarisation(Effect):
     """Without it every surface has the mean reflectance of s and p."""
 
     name = "polarisation"
+    of_glass = True
 
     def decide(self, scene: Scene, b) -> Decision:
         """Needed for polarised light, and where the polarisation by the entrance changes the reflectance of the exit noticeably."""
         light, lens = scene.light, scene.lens
-        if lens.mirror or lens.fresnel != "exact":
-            why = "a mirror reflects all light alike" if lens.mirror else f"fresnel = {lens.fresnel} knows no polarisation"
-            return Decision(self.name, False, why, present=False)
+        if lens.fresnel != "exact":
+            return Decision(self.name, False, f"fresnel = {lens.fresnel} knows no polarisation", present=False)
         if light.polarisation is not None:
             return Decision(self.name, True, f"the source is polarised at {light.polarisation:g} degrees")
         if b.incidence == 0:
@@ -51,7 +51,7 @@ class Polarisation(Effect):
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """Linear polarisation along x."""
-        if scene.lens.fresnel != "exact" or scene.lens.mirror:
+        if scene.lens.fresnel != "exact":
             return None
         return Probe(replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x")
 
@@ -77,9 +77,9 @@ class FieldPropagation(Action):
             return
         pose = m.element.pose
         e, flip = rotate_to_local(pose, state.polarised), m.side
-        d = (m.incoming[0], m.incoming[1], flip * m.incoming[2])
+        d = (m.hit.incoming[0], m.hit.incoming[1], flip * m.hit.incoming[2])
         e = (e[0], e[1], flip * e[2])
-        gx, gy = (flip * g for g in m.slopes)
+        gx, gy = (flip * g for g in m.hit.slopes)
         normal = (-gx, -gy, 1.0)
         if m.reflects:
             norm2 = 1.0 + gx * gx + gy * gy

@@ -43,9 +43,9 @@ class Roughness(Effect):
         """Slight roughness."""
         return Probe(replace(scene, lens=replace(scene.lens, roughness=AMOUNT)), None, f"slopes {AMOUNT:g}")
 
-    def action(self, system, requests: Requests) -> Action | None:
-        """The action, if an element is rough."""
-        return Microfacets() if any(e.roughness for e in system.elements) else None
+    def action(self, system, requests: Requests) -> Action:
+        """The facets."""
+        return Microfacets()
 
 
 class Microfacets(Action):
@@ -63,7 +63,7 @@ class Microfacets(Action):
             rays = getattr(m.tracer, "start", m.state)  # `start` is not set in front of the first free surface
             numbers = normal_numbers(FACETS + last - m.index, index_of(rays))
             self.noise[m.index] = tuple(m.element.roughness * n.to(m.state.power.dtype) for n in numbers)
-        m.slopes = tuple(g + n for g, n in zip(m.slopes, self.noise[m.index], strict=True))
+        m.hit.slopes = tuple(g + n for g, n in zip(m.hit.slopes, self.noise[m.index], strict=True))
 
 
 def index_of(rays: RayState) -> Tensor:

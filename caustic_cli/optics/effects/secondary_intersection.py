@@ -31,14 +31,15 @@ class SecondaryIntersection(Effect):
             return Decision(
                 self.name, False, "it is implemented at the last surface only, and other elements follow", present=False
             )
-        if b.slope_ratio < 1.0:
-            why = f"slopes up to {b.slope:.3g} are {b.slope_ratio:.3g} of those at which a ray that left could meet it again"
-            return Decision(self.name, False, why, b.slope_ratio, 1.0)
+        slope, ratio = b.exit.slope, b.exit.slope_ratio
+        if ratio < 1.0:
+            why = f"slopes up to {slope:.3g} are {ratio:.3g} of those at which a ray that left could meet it again"
+            return Decision(self.name, False, why, ratio, 1.0)
         return Decision(
             self.name,
             True,
-            f"slopes up to {b.slope:.3g} may intersect a ray that has left",
-            b.slope_ratio if math.isfinite(b.slope_ratio) else None,
+            f"slopes up to {slope:.3g} may intersect a ray that has left",
+            ratio if math.isfinite(ratio) else None,
             1.0,
         )
 
@@ -62,7 +63,7 @@ class SecondaryHits(Action):
         element, state, side = m.element, m.state, m.side
         surface, pose, heights = element.surface, element.pose, parameters[element.name]
         round_, interact = element.aperture.round, tracer.backend.interact
-        full = state.full((*m.local, *rotate_to_local(pose, state.direction)))
+        full = state.full((*m.hit.local, *rotate_to_local(pose, state.direction)))
         full = [c.double() for c in full]
         t, met = next_intersection(surface, heights, full[:3], full[3:], below=(side > 0) == m.reflects, round=round_)
         met = met & (state.power > 0)

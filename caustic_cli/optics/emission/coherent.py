@@ -61,7 +61,7 @@ class Mode:
             )
         dx, dy, h = x - px, y - py, pupil.z - pz
         r = torch.sqrt(dx * dx + dy * dy + h * h)
-        cone = source.cone_over(pupil.half_size, pupil.z, pupil.round)
+        cone = source.cone_over(pupil)
         cosine, secant = h / r, r / h
         to_axis = cosine
         if source.lean:
@@ -75,13 +75,12 @@ class Mode:
     def _even(self, u: Tensor, v: Tensor) -> Tensor:
         """Density of light from infinity on the pupil, 1/mm^2, with the profile if there is one."""
         pupil, profile = self.scene.pupil, self.scene.source.profile
-        (rx, ry) = pupil.half_size
-        area = math.pi * rx * ry if pupil.round else 4.0 * rx * ry
+        area = pupil.aperture.area
         if profile is None:
             return torch.full_like(u, self.part / area)
         table = torch.as_tensor(np.asarray(profile), dtype=torch.float64, device=u.device)
         a, b = ((c * n).long().clamp(0, n - 1) for c, n in zip((u, v), table.shape, strict=True))
-        return self.part / area * table[a, b] / mean_irradiance(np.asarray(profile), pupil.round)
+        return self.part / area * table[a, b] / mean_irradiance(np.asarray(profile), pupil.aperture)
 
 
 def central_mode(scene: Illuminated) -> Mode:

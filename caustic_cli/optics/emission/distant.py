@@ -20,15 +20,13 @@ class Distant(Emission):
     dimensions: ClassVar[int] = 4
 
     def _drawn(self, start: int, *draws: Tensor) -> RayState:
-        (u, v, a, b), (rx, ry), source = draws, self.scene.pupil.half_size, self.scene.source
+        (u, v, a, b), source = draws, self.scene.source
         if source.brightness is None:
             sine = a.sqrt() * math.sin(source.half_angle)  # uniform over projected solid angle: a disc of uniform radiance
             dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
         else:
             dx, dy = (w * c for w, c in zip(source.frame, points_by_brightness(source.brightness, a, b), strict=True))
-        flux, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
-        if self.scene.pupil.round:  # uniform over the disc
-            x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)
+        flux, (x, y) = torch.full_like(u, 1.0 / self.count), self.scene.pupil.aperture.spread(u, v)
         return self._at_pupil(x, y, (dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy)), flux, len(u) / self.count)
 
 

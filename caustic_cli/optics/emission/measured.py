@@ -25,7 +25,7 @@ from caustic_cli.optics.emission.base import Illuminated
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import SAMPLERS, random_numbers
-from caustic_cli.scene import Scene, Source
+from caustic_cli.scene import Pupil, Scene, Source
 from caustic_cli.scene.sources.rays import Measured
 
 #: Bits of each coordinate of the Morton code: finer than the spacing of a million rays.
@@ -65,7 +65,7 @@ class MeasuredRays:
     def _drawn(self) -> tuple[Tensor, ...]:
         """Points of the pupil x, y, mm, directions, and fractions of the source's power: (N,) each."""
         source, pupil = _of_file(self.scene.source), self.scene.pupil
-        x, y, met, part = _meeting(source, pupil.half_size, pupil.z, pupil.round)
+        x, y, met, part = _meeting(source, pupil)
         if self.rays < len(met):
             (rx, ry), chosen = pupil.half_size, random_numbers(self.seed, 0, torch.zeros(1, dtype=torch.int64))
             order = np.argsort(_morton(0.5 + 0.5 * x / rx, 0.5 + 0.5 * y / ry), kind="stable")
@@ -95,9 +95,9 @@ def _of_file(source: Source) -> Measured:
     return cast(Measured, source)
 
 
-def _meeting(source: Measured, half_size: tuple[float, float], z: float, round: bool) -> tuple[np.ndarray, ...]:
-    """Rays through an aperture: points x and y, mm, indices in the file, and fractions of the power."""
-    x, y, met = source.crossing(half_size, z, round)
+def _meeting(source: Measured, pupil: Pupil) -> tuple[np.ndarray, ...]:
+    """Rays through a pupil: points x and y, mm, indices in the file, and fractions of the power."""
+    x, y, met = source.crossing(pupil)
     (met,) = np.nonzero(met)
     if not len(met):
         raise InputError(
@@ -122,7 +122,7 @@ def coarseness(scene: Scene) -> tuple[float, int] | None:
     if scene.source.rays is None:
         return None
     source, lens = _of_file(scene.source), scene.lens
-    *_, part = _meeting(source, lens.half_size, lens.z_in, lens.round)
+    *_, part = _meeting(source, lens.pupil)
     equal = float(part.sum()) ** 2 / float((part * part).sum())  # effective number of rays of equal power
     noise = math.sqrt(math.prod(scene.screen.resolution) / equal)
     return noise, math.ceil(source.rays.count * (noise / WORTHY) ** 2)
@@ -156,10 +156,10 @@ def irradiance(scene: Scene, x: np.ndarray, y: np.ndarray, height: float) -> np.
     if scene.source.rays is None:
         return None
     source, lens = _of_file(scene.source), scene.lens
-    at_x, at_y, met, part = _meeting(source, lens.half_size, lens.z_in, lens.round)
+    at_x, at_y, met, part = _meeting(source, lens.pupil)
     d, n = source.rays.directions[met], lens.inside
     inside = np.sqrt(1.0 - (d[:, 0] ** 2 + d[:, 1] ** 2) / (n * n))
-    if lens.fresnel != "none" and not lens.mirror:
+    if lens.interior.fresnel != "none":
         part = part * (1.0 - reflectance("exact", d[:, 2], inside, 1.0 / n))
     way = (height - lens.z_in) / (n * inside)
     cells, _, _ = np.histogram2d(at_x + way * d[:, 0], at_y + way * d[:, 1], (x, y), weights=part)

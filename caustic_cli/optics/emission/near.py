@@ -53,7 +53,7 @@ class Near(Emission):
     def _drawn(self, start: int, *draws: Tensor) -> RayState:
         u, v, *aside = draws
         source, pupil = self.scene.source, self.scene.pupil
-        (rx, ry), cone = pupil.half_size, source.cone_over(pupil.half_size, pupil.z, pupil.round)
+        (rx, ry), cone = pupil.half_size, source.cone_over(pupil)
         per, (positions, powers) = self.shape[0] * self.shape[1], self._points
         which = torch.arange(start, start + len(u), device=self.device) // per
         part = powers[which] / per  # power of each ray at the source
@@ -67,10 +67,8 @@ class Near(Emission):
         lows = [x0 - radius, y0 - radius]
         highs = [x0 + radius, y0 + radius]
         # Distance from the projection of the source to the edge of the aperture.
-        room = rx - torch.hypot(x0, y0) if pupil.round else torch.minimum(rx - x0.abs(), ry - y0.abs())
-        within = (lows[0] >= -rx) & (highs[0] <= rx) & (lows[1] >= -ry) & (highs[1] <= ry)
-        if pupil.round:
-            within &= torch.maximum(-lows[0], highs[0]) ** 2 + torch.maximum(-lows[1], highs[1]) ** 2 <= rx * rx
+        room = torch.stack([r - far for far, r in pupil.aperture.distances(x0, y0)]).amin(0)
+        within = pupil.aperture.encloses(lows, highs)
         from_cone = within | (room >= NEAR * h) if source.aimed else torch.ones_like(within)
 
         w = _one_minus_cosine(source.intensity, cone, u)

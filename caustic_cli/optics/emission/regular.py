@@ -48,6 +48,5 @@ class RegularGrid(Emission):
             u, v = ((i.double() + s) / n for i, s, n in zip((k // nv, k % nv), shift, (nu, nv), strict=True))
             state = self.mode.through(u, v)
             power = torch.as_tensor(state.power) * cell
-            if pupil.round:
-                power = torch.where((2.0 * u - 1.0) ** 2 + (2.0 * v - 1.0) ** 2 <= 1.0, power, torch.zeros_like(power))
+            power = torch.where(pupil.aperture.covers(2.0 * u - 1.0, 2.0 * v - 1.0), power, torch.zeros_like(power))
             yield replace(state, power=power)

@@ -14,7 +14,7 @@ from caustic_cli.optics.gradient.fields import (
     index_field_of,
 )
 from caustic_cli.optics.gradient.integrator import Flow, flow, steps_for
-from caustic_cli.optics.gradient.transfer import Transfer, transfer
+from caustic_cli.optics.gradient.transfer import NextSurface, RayFlow, Transfer, transfer
 
 __all__ = [
     "Axial",
@@ -23,7 +23,9 @@ __all__ = [
     "Flow",
     "IndexField",
     "Luneburg",
+    "NextSurface",
     "Radial",
+    "RayFlow",
     "Selfoc",
     "SplineIndex",
     "Transfer",

@@ -12,6 +12,7 @@ surface, T is halved.  This changes the steps but not the ray.  delta is differe
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -48,87 +49,108 @@ class Transfer(NamedTuple):
     steps: int
 
 
-def index_at(march, field: IndexField, coefficients: Tensor | None, point) -> Tensor:
-    """Refractive index at points, (N,): the length L of a ray with p = 0 after one kick of unit size."""
-    zero, one = torch.zeros_like(point[0]), torch.ones_like(point[0])
-    return march(field, coefficients, point, (zero, zero, zero), one, 1, 2).length
+@dataclass(frozen=True)
+class RayFlow:
+    """Integration of rays in one medium: `flow` of a backend, the index field with its coefficients (None: its own), and the order
+    of the method."""
+
+    flow: Callable[..., Flow]
+    field: IndexField
+    coefficients: Tensor | None
+    order: int = ORDER
+
+    def on(self, point, momentum, time: Tensor, steps: int = 1) -> Flow:
+        """Rays after `time` (N,) mm of tau."""
+        return self.flow(self.field, self.coefficients, point, momentum, time, steps, self.order)
+
+    def index_at(self, point) -> Tensor:
+        """Refractive index at points, (N,): the length L of a ray with p = 0 after one kick of unit size."""
+        zero, one = torch.zeros_like(point[0]), torch.ones_like(point[0])
+        return self.flow(self.field, self.coefficients, point, (zero, zero, zero), one, 1, 2).length
+
+    def steps_for(self, point, momentum, time: Tensor) -> int:
+        """Number of steps that TOLERANCE requires."""
+        return steps_for(self.flow, self.field, self.coefficients, point, momentum, time, TOLERANCE, self.order)
 
 
-def transfer(
-    march: Callable[..., Flow],
-    field: IndexField,
-    coefficients: Tensor | None,
-    point,
-    direction,
-    surface: Surface,
-    heights: Tensor | None,
-    seen: Callable,
-    side: float,
-    steps: int | None = None,
-    order: int = ORDER,
-) -> Transfer:
-    """Trace rays to a surface through an index field.
+@dataclass(frozen=True)
+class NextSurface:
+    """The next surface, with its heights; the transformation of (points, vectors) from the medium's frame to the surface's; and the
+    side from which it is reached."""
 
-    Args:
-        march: `flow` of a backend.
-        point, direction: three (N,) float64 each, in the medium's frame.
-        surface, heights: the next surface.
-        seen: transformation of (points, vectors) from the medium's frame to the surface's.
-        side: from which the surface is reached.
-        steps: number of steps; None for as many as TOLERANCE requires.
-    """
-    n = index_at(march, field, coefficients, point)
-    p = tuple(n * d for d in direction)
-    o, v = seen(point, p)
-    middle = 0.5 * sum(surface.hull(None if heights is None else heights.detach()))
-    ahead = side * v[2] > PARALLEL
-    time = torch.where(ahead, (middle - o[2]) / torch.where(ahead, v[2], torch.ones_like(v[2])), torch.zeros_like(v[2]))
-    if steps is None:
-        steps = steps_for(march, field, coefficients, point, p, time, TOLERANCE, order)
-    near = ON_SURFACE * max(float(time.detach().abs().max()) * float(n.detach().mean()), 1e-3)
+    surface: Surface
+    heights: Tensor | None
+    seen: Callable
+    side: float
 
-    def above(at: Flow):
+    def estimate(self, point, momentum) -> tuple[Tensor, Tensor]:
+        """tau of the straight path to the surface's mean height, 0 for rays that do not go there, and which do, (N,)."""
+        o, v = self.seen(point, momentum)
+        middle = 0.5 * sum(self.surface.hull(None if self.heights is None else self.heights.detach()))
+        ahead = self.side * v[2] > PARALLEL
+        time = torch.where(ahead, (middle - o[2]) / torch.where(ahead, v[2], torch.ones_like(v[2])), torch.zeros_like(v[2]))
+        return time, ahead
+
+    def above(self, at: Flow):
         """f, f', slopes, and whether the point is inside the aperture, beyond which the surface is continued at constant height."""
-        (x, y, z), (px, py, pz) = seen(at.point, at.momentum)
+        (x, y, z), (px, py, pz) = self.seen(at.point, at.momentum)
+        surface = self.surface
         if surface.flat:
             return z, pz, (0.0, 0.0), torch.ones_like(z, dtype=torch.bool)
         (rx, ry) = surface.half_size
         within = (x.abs() <= rx) & (y.abs() <= ry)
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
-        height, gx, gy = (surface.at if torch.is_grad_enabled() and x.requires_grad else surface.evaluate)(heights, x, y)
+        height, gx, gy = (surface.at if torch.is_grad_enabled() and x.requires_grad else surface.evaluate)(self.heights, x, y)
         return z - height, pz - gx * px - gy * py, (gx, gy), within
 
-    def missing(begin: Flow) -> tuple[Tensor, Tensor]:
-        """delta of rays from this point on, and whether they reach the surface."""
-        f, rate, _, _ = above(begin)
+    def missing(self, rays: RayFlow, begin: Flow, near: float) -> tuple[Tensor, Tensor]:
+        """delta of rays from this point on, and whether they reach the surface, to within `near`, mm."""
+        f, rate, _, _ = self.above(begin)
         delta = torch.zeros_like(f)
-        ok = side * rate > PARALLEL
+        ok = self.side * rate > PARALLEL
         for _ in range(NEWTON):
             delta = delta - torch.where(ok, f / torch.where(ok, rate, torch.ones_like(rate)), torch.zeros_like(f))
-            f, rate, _, _ = above(march(field, coefficients, begin.point, begin.momentum, delta, 1, order))
-            ok = ok & (side * rate > PARALLEL) & f.isfinite()
+            f, rate, _, _ = self.above(rays.on(begin.point, begin.momentum, delta))
+            ok = ok & (self.side * rate > PARALLEL) & f.isfinite()
             if bool(((f.abs() <= near) | ~ok).all()):
                 break
         return torch.where(ok, delta, torch.zeros_like(delta)), ok & (f.abs() <= 10.0 * near)
 
+    def attached(self, rays: RayFlow, arrived: Flow, delta: Tensor, found: Tensor) -> Tensor:
+        """delta, differentiated at the root where a derivative is wanted."""
+        by_rays = torch.is_grad_enabled() and any(t.requires_grad for t in (*arrived.point, *arrived.momentum))
+        if not by_rays and (self.heights is None or not self.heights.requires_grad):
+            return delta
+        f, rate, _, _ = self.above(rays.on(arrived.point, arrived.momentum, delta))
+        rate = torch.where(found, rate.detach(), torch.ones_like(rate))
+        return delta - torch.where(found, (f - f.detach()) / rate, torch.zeros_like(f))
+
+
+def transfer(rays: RayFlow, point, direction, ahead: NextSurface, steps: int | None = None) -> Transfer:
+    """Trace rays to a surface through an index field.
+
+    Args:
+        point, direction: three (N,) float64 each, in the medium's frame.
+        steps: number of steps; None for as many as TOLERANCE requires.
+    """
+    n = rays.index_at(point)
+    p = tuple(n * d for d in direction)
+    time, towards = ahead.estimate(point, p)
+    if steps is None:
+        steps = rays.steps_for(point, p, time)
+    near = ON_SURFACE * max(float(time.detach().abs().max()) * float(n.detach().mean()), 1e-3)
     moved = torch.zeros_like(time)
     for guess in range(GUESSES):
-        arrived = march(field, coefficients, point, p, time + moved, steps, order)
+        arrived = rays.on(point, p, time + moved, steps)
         with torch.no_grad():
-            delta, found = missing(arrived)
+            delta, found = ahead.missing(rays, arrived, near)
             step = (time + moved).abs() / steps
-            far, astray = found & (delta.abs() > step), ahead & ~found
+            far, astray = found & (delta.abs() > step), towards & ~found
             if guess == GUESSES - 1 or not bool((far | astray).any()):
                 break
             moved = moved + torch.where(far, delta, torch.zeros_like(delta)) - torch.where(astray, 0.5 * (time + moved), 0.0 * time)
-    if (torch.is_grad_enabled() and any(t.requires_grad for t in (*arrived.point, *arrived.momentum))) or (
-        heights is not None and heights.requires_grad
-    ):
-        f, rate, _, _ = above(march(field, coefficients, arrived.point, arrived.momentum, delta, 1, order))
-        rate = torch.where(found, rate.detach(), torch.ones_like(rate))
-        delta = delta - torch.where(found, (f - f.detach()) / rate, torch.zeros_like(f))
-    end = march(field, coefficients, arrived.point, arrived.momentum, delta, 1, order)
-    _, _, slopes, within = above(end)
+    end = rays.on(arrived.point, arrived.momentum, ahead.attached(rays, arrived, delta, found))
+    _, _, slopes, within = ahead.above(end)
     norm = (end.momentum[0] ** 2 + end.momentum[1] ** 2 + end.momentum[2] ** 2).sqrt()
     return Transfer(
         end.point,

@@ -22,7 +22,7 @@ class Exit(NamedTuple):
     height: float
 
 
-class Frame(NamedTuple):
+class ScreenFrame(NamedTuple):
     """The screen's pixels: their numbers, the coordinates of the lower left corner and the pixel size, mm."""
 
     pixels_x: int

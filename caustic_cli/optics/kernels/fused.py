@@ -259,7 +259,7 @@ def forward(
     images (blocks, n_x + 4 r_x, n_y + 4 r_y, and -v_y % 4 more), ledgers and scratch (blocks, `scratch_rows`, b) are overwritten;
     they set the number of blocks.
 
-    exit_, frame, splat: an `Exit`, a `Frame` and a `Splat`.  Of oblique rays `along_x` and `along_y` (a, b) are their
+    exit_, frame, splat: an `Exit`, a `ScreenFrame` and a `Splat`.  Of oblique rays `along_x` and `along_y` (a, b) are their
     directions' components, and instead of the sag comes the distance along them to the surface; each has a net's number to
     itself, (a, b), whatever first, bu and du are.  oblique: True for them, None for rays along z, which are compiled apart.
     """

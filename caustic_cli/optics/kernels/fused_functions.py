@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import axial_refraction, blocks, filter_weights, fused, pixels, random_points
-from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
+from caustic_cli.optics.kernels.arguments import Exit, ScreenFrame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, scattered_surface
 from caustic_cli.optics.kernels.threads import ALL
@@ -178,7 +178,7 @@ def _arguments(
     eta, fresnel = interface
     oblique = rays[2] is not _NONE
     exit_ = Exit(float(eta), axial_refraction.FRESNEL[fresnel], float(start), float(height))
-    frame = Frame(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
+    frame = ScreenFrame(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
     splat = Splat(filter_weights.KINDS[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
     return oblique, (*rays, exit_, frame, splat, True if oblique else None)
 

@@ -42,7 +42,7 @@ PX, PY, W, PHI, OVER_X, OVER_Y, LEAN_X, LEAN_Y, BY_X, BY_Y, BY_W, VECTORS = rang
 SCRATCH = 5
 
 
-class Frame(NamedTuple):
+class PixelFrame(NamedTuple):
     """Parameters of screen and filter: pixels, lower edges and pixel sizes in mm; kind, sizes and alphas."""
 
     pixels_x: int
@@ -70,7 +70,7 @@ def splat_rays(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Fil
     """
     (low_x, low_y), (wide_x, wide_y), (alpha_x, alpha_y) = (map(float, pair) for pair in (screen.low, screen.pixel, filter.alpha))
     size_x, size_y = (2 * r + 1 for r in filter.reach)
-    frame = Frame(*screen.resolution, low_x, low_y, wide_x, wide_y, KINDS[filter.kind], size_x, size_y, alpha_x, alpha_y)
+    frame = PixelFrame(*screen.resolution, low_x, low_y, wide_x, wide_y, KINDS[filter.kind], size_x, size_y, alpha_x, alpha_y)
     padded, outside = _Splat.apply(x, y, weight, frame)
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
@@ -276,12 +276,12 @@ def _splat_tangent(block, x, y, weight, frame, along, images, outside):
         outside[block] += _scatter_tangent(v, count, frame, sx, sy, dx, dy, images[block])
 
 
-def _shape(frame: Frame) -> tuple[int, int]:
+def _shape(frame: PixelFrame) -> tuple[int, int]:
     """Of a padded image, with room for the scatter's last step of four pixels."""
     return frame.pixels_x + 2 * (frame.size_x - 1), frame.pixels_y + 2 * (frame.size_y - 1) + -frame.size_y % 4
 
 
-def _room(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def _room(frame: PixelFrame) -> tuple[np.ndarray, np.ndarray]:
     """For blocks' images and weights outside."""
     return np.empty((blocks(), *_shape(frame))), np.empty(blocks())
 
@@ -290,7 +290,7 @@ class _Splat(torch.autograd.Function):
     """x, y, weight and the frame -> padded image, the weight outside ()."""
 
     @staticmethod
-    def forward(x, y, weight, frame: Frame):
+    def forward(x, y, weight, frame: PixelFrame):
         images, outside = _room(frame)
         _splat(ALL, *components((x, y, weight)), frame, images, outside)
         return torch.from_numpy(total(images)), torch.tensor(outside.sum(), dtype=torch.float64)

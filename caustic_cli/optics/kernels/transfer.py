@@ -31,7 +31,7 @@ OX, OY, OZ, DX, DY, DZ, K, OVER, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY
 Vector = tuple[float, float, float]
 
 
-class Plane(NamedTuple):
+class TargetPlane(NamedTuple):
     """The target plane: p, a, b and n by components, and `forward`."""
 
     px: float
@@ -62,7 +62,7 @@ def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], 
         x, y: (N,) in the plane; of rays that are not on their way to it those of their origin, and meaningless.
         on_way: (N,) bool.
     """
-    plane = Plane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
+    plane = TargetPlane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
     return _Landing.apply(*origin, *direction, plane)
 
 
@@ -190,7 +190,7 @@ class _Landing(torch.autograd.Function):
     """o and d by components, and the plane -> x, y and whether the ray is on its way."""
 
     @staticmethod
-    def forward(ox, oy, oz, dx, dy, dz, plane: Plane):
+    def forward(ox, oy, oz, dx, dy, dz, plane: TargetPlane):
         ray = (ox, oy, oz, dx, dy, dz)
         count = _count(ray)
         (x, y), on_way = new(2, count), np.empty(count, np.bool_)

@@ -1,13 +1,11 @@
-"""Optical surfaces, one file each; all implement `base.Surface`."""
+"""Optical surfaces, one file each; all implement `base.Surface`.  Those of lenses are here, others in their own modules."""
 
 from __future__ import annotations
 
 from caustic_cli.optics.surfaces.base import Surface, SurfaceIntersection
-from caustic_cli.optics.surfaces.cylinder import Cylinder
 from caustic_cli.optics.surfaces.fixed import Fixed
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.surfaces.nurbs import Nurbs
 from caustic_cli.optics.surfaces.plane import Plane
 from caustic_cli.optics.surfaces.sphere import Sphere
 
-__all__ = ["Cylinder", "Fixed", "HeightField", "Nurbs", "Plane", "Sphere", "Surface", "SurfaceIntersection"]
+__all__ = ["Fixed", "HeightField", "Plane", "Sphere", "Surface", "SurfaceIntersection"]

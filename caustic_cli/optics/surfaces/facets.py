@@ -25,34 +25,23 @@ class FacetSurface(MeasuredSurface):
     """Facets between points (nx, ny, 3) mm, ascending along x and y.
 
     Args:
-        points: float64; the lattice of a rectangle, or of the concentric map.
-        round: whether it is that of a disc.
+        points: float64; the lattice of a rectangle.
         normals: (nx, ny, 3) at the points, of any length, towards +z: interpolated over each facet for the slopes.  None for the
             slopes of the flat facets.
         turned: rotate it by 180 degrees about the x axis, (x, y, z) -> (x, -y, -z).
     """
 
-    def __init__(self, points: np.ndarray, round: bool = False, normals: np.ndarray | None = None, turned: bool = False):
-        self.points, self.round, self.normals, self.up = points, round, normals, -1.0 if turned else 1.0
+    def __init__(self, points: np.ndarray, normals: np.ndarray | None = None, turned: bool = False):
+        self.points, self.normals, self.up = points, normals, -1.0 if turned else 1.0
         self.half_size = (float(points[-1, points.shape[1] // 2, 0]), float(points[points.shape[0] // 2, -1, 1]))
 
     @cached_property
     def _lines(self) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates of the lattice lines: x and y, or those of the square that is mapped to the disc."""
-        nx, ny = self.points.shape[:2]
-        if self.round:
-            return np.linspace(-1.0, 1.0, nx), np.linspace(-1.0, 1.0, ny)
+        """Coordinates x and y of the lattice lines."""
         return np.ascontiguousarray(self.points[:, 0, 0]), np.ascontiguousarray(self.points[0, :, 1])
 
     def _cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Indices i, j of the cells of points (N,)."""
-        if self.round:
-            r = np.hypot(x, y) / self.half_size[0]
-            wide = np.abs(x) >= np.abs(y)
-            near, far = np.where(wide, x, y), np.where(wide, y, x)
-            along = np.copysign(r, near)
-            across = along * (4.0 / np.pi) * np.arctan(far / np.where(near == 0.0, 1.0, near))
-            x, y = np.where(wide, along, across), np.where(wide, across, along)
         i, j = (
             np.clip(np.searchsorted(lines, at, "right") - 1, 0, len(lines) - 2)
             for lines, at in zip(self._lines, (x, y), strict=True)
@@ -85,7 +74,7 @@ class FacetSurface(MeasuredSurface):
 
     def turned(self) -> FacetSurface:
         """The surface rotated by 180 degrees about the x axis: -Z(x, -y)."""
-        return FacetSurface(self.points, self.round, self.normals, self.up > 0)
+        return type(self)(self.points, self.normals, self.up > 0)
 
     def heights_and_slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of the facets at points (N,) mm, in blocks."""
@@ -106,7 +95,7 @@ class FacetSurface(MeasuredSurface):
         at = (self.points[:-1, :-1, :2] + self.points[1:, :-1, :2] + self.points[:-1, 1:, :2] + self.points[1:, 1:, :2]) / 4.0
         aside = 0.01 * (self.points[1:, 1:, :2] - self.points[:-1, :-1, :2])  # on both sides of either diagonal
         inside = [(at + [[sx, sy]] * aside).reshape((nx - 1) * (ny - 1), 2) for sx, sy in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-        found = [FacetSurface(self.points, self.round).heights_and_slopes(*p.T)[1:] for p in inside]
+        found = [type(self)(self.points).heights_and_slopes(*p.T)[1:] for p in inside]
         most = [max(float(np.abs(slopes[k]).max()) for slopes in found) for k in (0, 1)]
         if self.normals is not None:
             own = [float(np.abs(self.normals[..., k] / self.normals[..., 2]).max()) for k in (0, 1)]
@@ -116,6 +105,25 @@ class FacetSurface(MeasuredSurface):
     def slope_bounds(self, heights: None) -> tuple[float, float]:
         """Of all facets and normals."""
         return self._steepest
+
+
+class DiscFacets(FacetSurface):
+    """Facets between the points of a lattice that the concentric map takes to a disc."""
+
+    @cached_property
+    def _lines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates of the lattice lines in the square that is mapped to the disc."""
+        nx, ny = self.points.shape[:2]
+        return np.linspace(-1.0, 1.0, nx), np.linspace(-1.0, 1.0, ny)
+
+    def _cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As of facets."""
+        r = np.hypot(x, y) / self.half_size[0]
+        wide = np.abs(x) >= np.abs(y)
+        near, far = np.where(wide, x, y), np.where(wide, y, x)
+        along = np.copysign(r, near)
+        across = along * (4.0 / np.pi) * np.arctan(far / np.where(near == 0.0, 1.0, near))
+        return super()._cells(np.where(wide, along, across), np.where(wide, across, along))
 
 
 def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.bspline import SplineSpace, over_grid
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
-from caustic_cli.scene import Lens
+from caustic_cli.scene import Aperture, Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,16 +116,13 @@ class HeightField(Surface[Tensor]):
         low, high = torch.aminmax(heights.detach())
         return float(low), float(high)
 
-    def least(self, heights: Tensor, round: bool = False) -> float:
-        """Least height over the aperture, a rectangle or its inscribed circle, mm, sampled at 8 points per knot span, at most 4001
-        along an axis, including the corners and the centre."""
+    def least(self, heights: Tensor, aperture: Aperture) -> float:
+        """Least height over an aperture of its half widths, mm, sampled at 8 points per knot span, at most 4001 along an axis,
+        including the corners and the centre."""
         points = [torch.linspace(0.0, 1.0, min(4001, 8 * (len(s.breaks) - 1) + 1), dtype=torch.float64) for s in self.spaces]
         u, v = (s.banded(p) for s, p in zip(self.spaces, points, strict=True))
         z = over_grid(u, heights.detach().double().cpu(), v)
-        if round:
-            inside = (2.0 * points[0][:, None] - 1.0).square() + (2.0 * points[1][None, :] - 1.0).square() <= 1.0
-            z = z[inside]
-        return float(z.min())
+        return float(z[aperture.covers(2.0 * points[0][:, None] - 1.0, 2.0 * points[1][None, :] - 1.0)].min())
 
     def centred(self, heights: Tensor) -> tuple[Tensor, float]:
         """Heights minus their mean, and the mean, mm: a sag small compared with the thickness keeps all its digits."""

@@ -5,14 +5,7 @@ ray_aiming     rays through the points of a uniform grid on that plane
 interpolation  interpolation of the wavefront between the traced nodes
 sampling       sampling of the field on the reference plane and on the screen
 propagation    the Fresnel integral as a single Fourier transform, integrated over pixels, with its adjoint
-receiver       the plane of an image in space
+unsupported    scenes without a wave image, and why
 tilted         images on tilted screens
 image          incoherent sum over wavelengths and source points
 """
-
-from __future__ import annotations
-
-from caustic_cli.optics.waves.image import WaveImage, image_of, lines_of, lines_of_system, wave_image
-from caustic_cli.optics.waves.sampling import NoWaveImage
-
-__all__ = ["NoWaveImage", "WaveImage", "image_of", "lines_of", "lines_of_system", "wave_image"]

@@ -21,14 +21,15 @@ from torch import Tensor
 
 from caustic_cli.optics.emission.coherent import Mode, central_mode, modes, outermost_modes, spots
 from caustic_cli.optics.interaction import Parameters
+from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.resolution import WHITE_LINES, white
-from caustic_cli.optics.spread import Convolution, Spread, spread_of
+from caustic_cli.optics.spread import POINT, Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.waves.propagation import cells, phase_of, power_by_blocks, power_on_pixels
-from caustic_cli.optics.waves.receiver import Plane, Receiver, receiver_of
-from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling, memory_free
+from caustic_cli.optics.waves.sampling import Sampling, memory_free
 from caustic_cli.optics.waves.tilted import power_on_tilted
+from caustic_cli.optics.waves.unsupported import NoWaveImage, receiver_of
 from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, distance_of, survey, wavefront
 from caustic_cli.scene import Light, Scene, Screen, Source
 from caustic_cli.scene.materials import refractive_index
@@ -101,18 +102,17 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
             for line in lines_of(one, field, wavelengths)
         ]
     found, own, systems = [], scene.light.wavelengths, {}
-    channels: list[int | None]
+    channels: tuple[int | None, ...]
     if wavelengths is not None or not own:
         given = wavelengths or white(WHITE_LINES)
-        parts, channels = (1.0 / len(given),) * len(given), [None] * len(given)
+        parts, channels = (1.0 / len(given),) * len(given), (None,) * len(given)
     else:
-        given, parts = own, scene.light.parts
-        channels = list(range(len(given))) if scene.colored else [None] * len(given)
+        given, parts, channels = own, scene.light.parts, scene.light.channels
     states = (0.0, 90.0) if scene.light.tracked and scene.light.polarisation is None else (scene.light.polarisation,)
     for wavelength, part, channel in zip(given, parts, channels, strict=True):
         lens = replace(scene.lens, roughness=0.0)
-        if lens.glass is not None and not lens.mirror:
-            lens = replace(lens, index=refractive_index(lens.glass, wavelength))
+        if (glass := lens.interior.glass) is not None:
+            lens = replace(lens, index=refractive_index(glass, wavelength))
         for state in states:
             if (lens.index, state) not in systems:  # light of one index and polarisation takes the same paths
                 one = replace(scene, lens=lens, light=Light(state))
@@ -208,6 +208,33 @@ def _alike(lines: list[Line]) -> list[list[Line]]:
     return list(groups.values())
 
 
+def _parts_of(optics: Optics, extended: bool, receiver: Receiver, blur: float) -> tuple[Spread, int]:
+    """How a source is represented: the point-spread function of a mode, and the modes per position of the source, 0 for a single
+    mode of the whole source."""
+    if not extended:
+        return POINT, 0
+    each = max(LEAST_EACH, EACH // max(1, len(optics.system.source.points()[0])))
+    spread = spread_of(optics.system, optics.landing, device_of(optics)) if receiver.across else None
+    if spread is None:
+        return POINT, each
+    parts = (spread.error / (ALLOWED * max(blur, *receiver.pixel))) ** 2
+    each = 0 if parts <= 1.0 else min(each, math.ceil(parts))
+    return (POINT if each and not max(spread.half) > 0 else spread), each
+
+
+def _region(receiver: Receiver, surveys: list[Survey], watched: tuple | None, spread: Spread, blur: float) -> tuple[tuple, tuple]:
+    """Limits of the computed region on the receiver's plane, mm; watched: see `Imager.of`."""
+    low, high = receiver.extent()
+    lows, highs = (list(c) for c in (watched if watched and receiver.across else (low, high)))
+    for seen in surveys:
+        lands = seen.mostly if watched else seen.landing
+        for k in (0, 1):
+            room = max(BESIDE * (high[k] - low[k]), spread.reach()[k] + receiver.pixel[k])
+            lows[k] = min(lows[k], max(lands[0][k] - BLURS * blur, low[k] - room))
+            highs[k] = max(highs[k], min(lands[1][k] + BLURS * blur, high[k] + room))
+    return tuple(lows), tuple(highs)
+
+
 @dataclass(frozen=True)
 class Imager:
     """Common settings of the images of a source's lines and modes: the computed region and the sampling.
@@ -219,13 +246,11 @@ class Imager:
 
     source: Source
     receiver: Receiver
-    plane: Plane
     seen: Survey
     sampling: Sampling
-    spread: Spread | None
+    spread: Spread
     nodes: tuple[int, int]
     each: int
-    upright: bool
     exact: bool = False
     tapered: bool = True
     perturbation: Perturbation | None = None
@@ -254,40 +279,24 @@ class Imager:
             NoWaveImage: see `wave_image`.
         """
         ways = [group[0] for group in _alike(lines)]
-        system = ways[0].system
-        if system.source.rays is not None:
-            raise NoWaveImage("a ray file contains no phase, so that it has no wave image")
-        plane, upright = receiver.plane(system.axis), receiver.across(system.axis)
+        system, plane = ways[0].system, receiver.plane
         distance = distance_of(system, parameters, plane)
         alike = [Optics(k.system, central_mode(system), parameters, k.length, k.label, plane, distance) for k in ways]
         outer = outermost_modes(system)
         surveys = [survey(replace(one, mode=mode)) for one in alike for mode in (one.mode, *outer)]
         lengths = tuple(k.behind for k in lines)
         blur = math.sqrt(max(lengths) * distance * surveys[0].magnification)
-        spread = spread_of(system, alike[0].landing, device_of(alike[0])) if outer and upright else None
-        each = 0 if not outer else max(LEAST_EACH, EACH // max(1, len(system.source.points()[0])))
-        if spread is not None:
-            parts = (spread.error / (ALLOWED * max(blur, *receiver.pixel))) ** 2
-            each = 0 if parts <= 1.0 else min(each, math.ceil(parts))
-            spread = None if each and not max(spread.half) > 0 else spread
-        low, high = receiver.extent(plane)
-        lows, highs = (list(c) for c in (watched if watched and upright else (low, high)))
-        for seen in surveys:
-            lands = seen.mostly if watched else seen.landing
-            for k in (0, 1):
-                room = max(BESIDE * (high[k] - low[k]), spread.reach()[k] + receiver.pixel[k] if spread else 0.0)
-                lows[k] = min(lows[k], max(lands[0][k] - BLURS * blur, low[k] - room))
-                highs[k] = max(highs[k], min(lands[1][k] + BLURS * blur, high[k] + room))
+        spread, each = _parts_of(alike[0], bool(outer), receiver, blur)
         light = (
             tuple(min(s.light[0][k] for s in surveys) for k in (0, 1)),
             tuple(max(s.light[1][k] for s in surveys) for k in (0, 1)),
         )
-        sampling = Sampling.of(light, (tuple(lows), tuple(highs)), receiver.pixel, distance, lengths, finer)
+        sampling = Sampling.of(light, _region(receiver, surveys, watched, spread, blur), receiver.pixel, distance, lengths, finer)
         spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
         nodes, enough = sampling.count, max(LEAST_NODES, A_SPAN * max(spans, default=0))
         if not dense:
             nodes = min(nodes[0], enough), min(nodes[1], enough)
-        return cls(system.source, receiver, plane, surveys[0], sampling, spread, nodes, each, upright, exact, watched is None)
+        return cls(system.source, receiver, surveys[0], sampling, spread, nodes, each, exact, watched is None)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
         """The wave image of these lines, at heights {name: (n, m) mm} close to those for which the sampling was chosen."""
@@ -309,7 +318,7 @@ class Imager:
             leaving - float(image.detach().sum()),
             tuple(dict.fromkeys(line.wavelength for line in lines)),
             len(self.modes(lines[0].system)),
-            self.spread.error / math.sqrt(max(1, self.each)) if self.spread else 0.0,
+            self.spread.error / math.sqrt(max(1, self.each)),
             self.sampling.padded,
         )
 
@@ -319,7 +328,7 @@ class Imager:
 
     def optics(self, line: Line, mode: Mode, parameters: Parameters) -> Optics:
         """The wavefront computation of one mode."""
-        return Optics(line.system, mode, parameters, line.length, line.label, self.plane, self.sampling.distance)
+        return Optics(line.system, mode, parameters, line.length, line.label, self.receiver.plane, self.sampling.distance)
 
     def front(self, line: Line, mode: Mode, parameters: Parameters, sensitive: bool = False) -> Wavefront:
         """The wavefront of a mode behind the lens, on `nodes`."""
@@ -329,9 +338,8 @@ class Imager:
         if self.perturbation is None:
             return wavefront(optics, seen, s.low, (dx, dy), self.nodes, sensitive, self.exact)
         found = wavefront(optics, seen, s.low, (dx, dy), self.nodes, True, self.exact)
-        assert found.sensitivity is not None and found.at_x is not None and found.at_y is not None
-        off = self.perturbation(found.at_x.reshape(-1), found.at_y.reshape(-1)).view(found.path.shape)
-        return replace(found, path=found.path + found.sensitivity * off)
+        assert found.last is not None
+        return replace(found, path=found.path + found.last.sensitivity * found.last.displacement(self.perturbation))
 
     def watched(self, front: Wavefront, length: float) -> Wavefront:
         """The wavefront restricted to light that lands inside the transform's field of view at a wavelength, mm."""
@@ -343,14 +351,11 @@ class Imager:
     @cached_property
     def spreading(self) -> list[Convolution]:
         """Convolutions on the screen's pixels: of the whole source, or of each mode of a position; empty for point sources."""
-        if self.spread is None:
-            return []
-        pixel = self.receiver.pixel
-        return self.spread.parts_on(pixel, spots(self.source, self.each)) if self.each else [self.spread.on(pixel)]
+        return self.spread.convolutions(self.receiver.pixel, spots(self.source, self.each) if self.each else [])
 
     def masks(self, line: Line, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Overlap matrices between samples and (subdivided) pixels of an upright screen, along each axis."""
-        s, low, found = self.sampling, self.receiver.extent(self.plane)[0], []
+        s, low, found = self.sampling, self.receiver.extent()[0], []
         sub, beside = (self.spreading[0].cut, self.spreading[0].beside) if self.spreading else (1, (0, 0))
         first, spacing = s.first(line.behind), s.spacing(line.behind)
         for k in (0, 1):
@@ -382,8 +387,8 @@ class Imager:
     def image(self, line: Line, front: Wavefront, mode: int, dtype: torch.dtype) -> tuple[Tensor, float]:
         """Power on pixels of one mode, by its number, at one wavelength, float64, and its total power."""
         s, wide = self.sampling, 8 if dtype == torch.float32 else 16
-        if not self.upright:
-            found = power_on_tilted(self.receiver, self.plane, s, self.watched(front, line.behind), line.length, line.behind, dtype)
+        if not self.receiver.across:
+            found = power_on_tilted(self.receiver, s, self.watched(front, line.behind), line.length, line.behind, dtype)
             return found, front.power()
         rows, columns = self.masks(line, front.path.device, dtype)
         if torch.is_grad_enabled() and front.path.requires_grad:

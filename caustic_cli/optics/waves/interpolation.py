@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -66,28 +67,47 @@ def extrapolated(c: Tensor, dark: Tensor) -> Tensor:
     return c
 
 
+@dataclass(frozen=True)
+class Lit:
+    """What is lit of a grid on the reference plane, (n, m) each."""
+
+    #: Signed distances to the pupil's edges, mm on this plane, positive inside; `edge_y` None for a circle.
+    edge_x: Tensor
+    edge_y: Tensor | None
+    #: 0 where light is blocked behind the pupil, 1 elsewhere; None if nothing is blocked.
+    shade: Tensor | None
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> Lit:
+        """The same with a function applied to everything."""
+        return Lit(*(None if c is None else function(c) for c in (self.edge_x, self.edge_y, self.shade)))  # type: ignore[arg-type]
+
+    def fraction(self, step: tuple[float, float]) -> Tensor:
+        """Lit fraction of each cell of widths `step`, mm."""
+        if self.edge_y is None:
+            lit = (self.edge_x / (0.5 * (step[0] + step[1])) + 0.5).clamp(0.0, 1.0)
+        else:
+            lit = (self.edge_x / step[0] + 0.5).clamp(0.0, 1.0) * (self.edge_y / step[1] + 0.5).clamp(0.0, 1.0)
+        return lit if self.shade is None else lit * self.shade.clamp(0.0, 1.0)
+
+
 @dataclass
 class FineWavefront:
     """A wavefront on a fine grid: columns are interpolated already, rows on demand.
 
-    root: square root of the power of a fully lit cell; shade: see `Wavefront`; step: of the fine grid; along_x: weights of the
-    rows, see `lagrange_weights`.
+    root: square root of the power of a fully lit cell; step: of the fine grid; along_x: weights of the rows, see
+    `lagrange_weights`.
     """
 
     path: Tensor
     root: Tensor
-    edge_x: Tensor
-    edge_y: Tensor | None
-    shade: Tensor | None
+    lit: Lit
     step: tuple[float, float]
     along_x: tuple[Tensor, Tensor] | None
 
     def rows(self, part: slice = slice(None)) -> tuple[Tensor, Tensor, Tensor]:
         """Path, mm; square root of the power of a fully lit cell; lit fraction of the cell: (rows, m) float64 each."""
-        lit = pupil_coverage(self._at(self.edge_x, part), None if self.edge_y is None else self._at(self.edge_y, part), self.step)
-        if self.shade is not None:
-            lit = lit * self._at(self.shade, part).clamp(0.0, 1.0)
-        return self._at(self.path, part), self._at(self.root, part), lit
+        lit = self.lit.mapped(lambda c: self._at(c, part))
+        return self._at(self.path, part), self._at(self.root, part), lit.fraction(self.step)
 
     @cached_property
     def whole(self) -> tuple[Tensor, Tensor]:
@@ -97,10 +117,3 @@ class FineWavefront:
 
     def _at(self, c: Tensor, part: slice) -> Tensor:
         return c[part] if self.along_x is None else interpolate(c, tuple(t[part] for t in self.along_x), None)
-
-
-def pupil_coverage(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, float]) -> Tensor:
-    """Fraction of each cell inside the pupil, from signed distances to its edges."""
-    if edge_y is None:
-        return (edge_x / (0.5 * (step[0] + step[1])) + 0.5).clamp(0.0, 1.0)
-    return (edge_x / step[0] + 0.5).clamp(0.0, 1.0) * (edge_y / step[1] + 0.5).clamp(0.0, 1.0)

@@ -19,7 +19,7 @@ from typing import TypeVar
 
 from scipy.fft import next_fast_len
 
-from caustic_cli.errors import CausticError
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 
 #: Width of the computed region relative to screen and light; N over n; least number of samples across the light.
 BEYOND, FINER, LEAST = 1.06, 1.08, 128
@@ -34,10 +34,6 @@ COPIES = 2
 
 #: A count, or a length.
 Number = TypeVar("Number", int, float)
-
-
-class NoWaveImage(CausticError):
-    """The wave image of a scene is undefined, or cannot be computed."""
 
 
 @dataclass(frozen=True)

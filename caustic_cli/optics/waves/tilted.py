@@ -19,18 +19,17 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.waves.propagation import phase_of
-from caustic_cli.optics.waves.receiver import Plane, Receiver, dot
-from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling
+from caustic_cli.optics.waves.sampling import Sampling
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.optics.waves.wavefront import Wavefront
 
 #: Tolerated shift of light between planes, in pixels; largest number of planes; sample points along each axis of a pixel.
 STEP, MOST_PLANES, A_PIXEL = 0.2, 400, 4
 
 
-def power_on_tilted(
-    r: Receiver, plane: Plane, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype
-) -> Tensor:
+def power_on_tilted(r: Receiver, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype) -> Tensor:
     """Power of one wavefront on a tilted screen's pixels, float64.
 
     length, behind: wavelength in vacuum and in the image space, mm.
@@ -38,6 +37,7 @@ def power_on_tilted(
     Raises:
         NoWaveImage: too many planes are needed.
     """
+    plane = r.plane
     e1, e2, e3 = plane.axes
     device = front.path.device
     u, v = (
@@ -128,7 +128,7 @@ def _mean_map(front: Wavefront, distance: float) -> list[tuple[float, float, flo
         (front.low[1] + front.step[1] * (torch.arange(m).to(weight) + 0.5))[None, :].expand(n, m),
     )
     lit = weight > 0
-    for big, x in zip((front.big_x, front.big_y), foot, strict=True):
+    for big, x in zip(front.landing, foot, strict=True):
         q, c, w = ((big - x) / distance)[lit], big[lit], weight[lit] / weight[lit].sum()
         mean_q, mean_c = float((w * q).sum()), float((w * c).sum())
         spread = float((w * (c - mean_c) ** 2).sum())

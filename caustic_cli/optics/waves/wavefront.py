@@ -23,6 +23,7 @@ as required.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -31,12 +32,13 @@ from torch import Tensor
 from caustic_cli.optics.effects import Requests
 from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.interaction import Interaction, Parameters
+from caustic_cli.optics.receiver import NormalPlane, dot
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.optics.waves.interpolation import FineWavefront, extrapolated, interpolate, lagrange_weights, pupil_coverage
+from caustic_cli.optics.waves.interpolation import FineWavefront, Lit, extrapolated, interpolate, lagrange_weights
 from caustic_cli.optics.waves.ray_aiming import aimed_rays
-from caustic_cli.optics.waves.receiver import Plane, dot
-from caustic_cli.optics.waves.sampling import NoWaveImage
+from caustic_cli.optics.waves.unsupported import NoWaveImage
+from caustic_cli.scene import Pupil
 
 #: Points along each side of the pupil for a survey; fraction of rays outside the quantiles `mostly`.
 SURVEY, FEW = 65, 0.01
@@ -88,7 +90,7 @@ class Optics:
     parameters: Parameters
     wavelength: float
     label: float | None
-    plane: Plane
+    plane: NormalPlane
     distance: float
 
     @property
@@ -133,7 +135,7 @@ class Optics:
         return Intercepts(big_x - far * qx, big_y - far * qy, path, qx, qy, big_x, big_y, power)
 
 
-def distance_of(system: System, parameters: Parameters, plane: Plane) -> float:
+def distance_of(system: System, parameters: Parameters, plane: NormalPlane) -> float:
     """L, the distance of a plane from the centre of the last surface, mm."""
     last = system.elements[-1]
     x, y, z = last.pose.position
@@ -172,8 +174,7 @@ def survey(optics: Optics) -> Survey:
     f = optics.intercepts(u, v)
     lit = f.power > 0
     pupil = optics.mode.scene.pupil
-    if pupil.round:
-        lit &= (2.0 * u - 1.0) ** 2 + (2.0 * v - 1.0) ** 2 <= 1.0 + 1e-12
+    lit &= pupil.aperture.covers(2.0 * u - 1.0, 2.0 * v - 1.0, 1e-12)
     if int(lit.sum()) < 16:
         raise NoWaveImage("no light reaches the screen, so it has no wave image")
     light, landing = (
@@ -190,7 +191,7 @@ def survey(optics: Optics) -> Survey:
             if float(end) != edge:  # an edge within the pupil, somewhere between this point and the next
                 reach = (high if upper else low) + (1.0 if upper else -1.0) * abs(scale[-1]) / (SURVEY - 1)
             else:  # the survey's points may miss a circle's edge
-                reach = offset[-1] + scale[-1] * edge if pupil.round else low
+                reach = offset[-1] + scale[-1] * edge if pupil.aperture.round else low
             low, high = (low, max(high, reach)) if upper else (min(low, reach), high)
         lows.append(low)
         highs.append(high)
@@ -210,37 +211,40 @@ def _jacobian(a: Tensor, b: Tensor, dx: float, dy: float) -> Tensor:
     return ax * by - ay * bx
 
 
+@dataclass(frozen=True)
+class LastSurface:
+    """The rays of a wavefront at the last surface, (n, m) each: points x, y, mm, and the derivative of the path by its height."""
+
+    x: Tensor
+    y: Tensor
+    sensitivity: Tensor
+
+    def displacement(self, height: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """A function of points (N,) mm at these rays, (n, m)."""
+        return height(self.x.reshape(-1), self.y.reshape(-1)).view(self.x.shape)
+
+
 @dataclass
 class Wavefront:
-    """The wavefront on a uniform grid of intercepts, (n, m) float64 each.
+    """The wavefront on a uniform grid of intercepts, (n, m) float64 each."""
 
-    low, step: of the cells, whose centres are the nodes, mm; path: v minus its mean, mm; density: power per mm^2; edge_x, edge_y:
-    signed distances to the pupil's edges, mm on this plane, positive inside, edge_y None for a circle; big_x, big_y: landing
-    points, mm;
-    shade: 0 where light is blocked behind the pupil, with path and density extrapolated, and 1 elsewhere, None if nothing is
-    blocked;
-    sensitivity: derivative of the path by the height of the last surface; at_x, at_y: points of that surface, mm; these are None
-    unless requested.
-    """
-
+    #: Lower edges and widths of the cells, whose centres are the nodes, mm.
     low: tuple[float, float]
     step: tuple[float, float]
+    #: v minus its mean, mm; power per mm^2.  Both are extrapolated where light is blocked behind the pupil.
     path: Tensor
     density: Tensor
-    edge_x: Tensor
-    edge_y: Tensor | None
-    big_x: Tensor
-    big_y: Tensor
-    shade: Tensor | None = None
-    sensitivity: Tensor | None = None
-    at_x: Tensor | None = None
-    at_y: Tensor | None = None
+    lit: Lit
+    #: Landing points X, Y, mm.
+    landing: tuple[Tensor, Tensor]
+    #: None unless requested.
+    last: LastSurface | None = None
     _fine: tuple | None = field(default=None, init=False, repr=False)
 
     def within(self, middle: tuple[float, float], width: tuple[float, float]) -> Wavefront:
         """The wavefront tapered to light that lands within a rectangle on the screen, mm; itself if that is all."""
         density, lit = self.density, self.density > 0
-        for big, m, w in zip((self.big_x, self.big_y), middle, width, strict=True):
+        for big, m, w in zip(self.landing, middle, width, strict=True):
             inside = ((0.5 * w - (big - m).abs()) / (SOFT * w)).clamp(0.0, 1.0)
             if bool(((inside < 1.0) & lit).any()):
                 density = density * inside
@@ -248,10 +252,7 @@ class Wavefront:
 
     def power(self) -> float:
         """Total power."""
-        lit = pupil_coverage(self.edge_x, self.edge_y, self.step).detach()
-        if self.shade is not None:
-            lit = lit * self.shade
-        return float((self.density.detach() * lit).sum()) * self.step[0] * self.step[1]
+        return float((self.density.detach() * self.lit.fraction(self.step).detach()).sum()) * self.step[0] * self.step[1]
 
     def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int]) -> FineWavefront:
         """The wavefront on a finer grid; the last result is cached."""
@@ -263,9 +264,8 @@ class Wavefront:
         )
         bright = self.density > 0  # at 0 a root has no derivative
         root = torch.where(bright, self.density, torch.ones_like(self.density)).sqrt() * bright * (step[0] * step[1]) ** 0.5
-        path, root, edge_x = (interpolate(c, None, y) for c in (self.path, root, self.edge_x))
-        edge_y, shade = (None if c is None else interpolate(c, None, y) for c in (self.edge_y, self.shade))
-        fine = FineWavefront(path, root, edge_x, edge_y, shade, step, x)
+        path, root = (interpolate(c, None, y) for c in (self.path, root))
+        fine = FineWavefront(path, root, self.lit.mapped(lambda c: interpolate(c, None, y)), step, x)
         self._fine = key, fine
         return fine
 
@@ -295,10 +295,10 @@ def wavefront(
     x, y = (c.reshape(-1) for c in torch.meshgrid(x, y, indexing="ij"))
     with torch.no_grad():
         f, held, behind = aimed_rays(optics, seen, (x, y), shape, step, left)
-    at: dict[str, Tensor] = {}
+    last: LastSurface | None = None
     if sensitive:
         with torch.no_grad():
-            f, at = _sensitive(optics, *held)
+            f, last = _sensitive(optics, held, shape)
     elif differentiable:
         f = optics.intercepts(*held)
     ex, ey = x - f.x, y - f.y
@@ -308,18 +308,40 @@ def wavefront(
         raise NoWaveImage(CROSSES)
     known = ~dark | (behind & (f.power > 0))  # next to dark regions use the path of rays from the edge of the light
     path = torch.where(known, path - path[~dark].detach().mean(), torch.zeros_like(path))
-    dark = dark.view(shape)
-    ex, ey = ex.view(shape), ey.view(shape)
-    # Pupil point of the light at each grid point, scaled to mm on this plane; its Jacobian gives the density.
-    px, py = (((h - 0.5) * c).view(shape) for h, c in zip(held, seen.scale, strict=True))
-    gone = [extrapolated((p + e).detach() - c.view(shape), dark) + c.view(shape) for p, e, c in ((px, ex, x), (py, ey, y))]
+    apart, at = (ex.view(shape), ey.view(shape)), (x.view(shape), y.view(shape))
+    density, lit = _density(optics.mode.scene.pupil, seen, held, apart, at, f.power.view(shape), dark.view(shape), step)
+    big_x, big_y = (c.detach().view(shape) for c in (f.big_x, f.big_y))
+    return Wavefront(low, step, path.view(shape), density, lit, (big_x, big_y), last)
+
+
+def _density(
+    pupil: Pupil,
+    seen: Survey,
+    held: tuple[Tensor, Tensor],
+    apart: tuple[Tensor, Tensor],
+    at: tuple[Tensor, Tensor],
+    power: Tensor,
+    dark: Tensor,
+    step: tuple[float, float],
+) -> tuple[Tensor, Lit]:
+    """Power per mm^2 on a grid, and what of it is lit, from the Jacobian of the pupil points of the light at its points.
+
+    Args:
+        held: points u, v of the pupil of the traced rays, (N,).
+        apart: displacement of the grid from their intercepts; at: its points, (n, m) mm; step: its spacing.
+        power: of the rays, a density on the pupil; dark: whether light is blocked there, (n, m).
+
+    Raises:
+        NoWaveImage: see `wavefront`.
+    """
+    (ex, ey), (x, y) = apart, at
+    px, py = (((h - 0.5) * c).view(dark.shape) for h, c in zip(held, seen.scale, strict=True))
+    gone = [extrapolated((p + e).detach() - c, dark) + c for p, e, c in ((px, ex, x), (py, ey, y))]
     (pxx, pxy), (pyx, pyy) = (torch.gradient(p, spacing=step, dim=(0, 1), edge_order=2) for p in gone)
     px = torch.where(dark, gone[0], px + pxx * ex + pxy * ey)
     py = torch.where(dark, gone[1], py + pyx * ex + pyy * ey)
-    pupil = optics.mode.scene.pupil
     mm = [2.0 * pupil.half_size[k] / abs(seen.scale[k]) for k in (0, 1)]
     squeeze = mm[0] * mm[1] * _jacobian(px, py, *step)
-    power = f.power.view(shape)
     crossed = torch.where((squeeze.detach() <= 0) & ~dark, power.detach(), torch.zeros_like(power))
     if float(crossed.sum()) > CROSSED * float(power.detach().sum()):
         raise NoWaveImage(CROSSES)
@@ -327,34 +349,22 @@ def wavefront(
     by_x, by_y = torch.gradient(power.detach(), spacing=step, dim=(0, 1), edge_order=2)
     density = (power + torch.where(dark, torch.zeros_like(ex), by_x * ex + by_y * ey)).clamp_min(0.0) * squeeze.clamp_min(0.0)
     rx, ry = (abs(s) / 2.0 for s in seen.scale)
-    edge_x, edge_y = (rx - torch.hypot(px, py * (rx / ry)), None) if pupil.round else (rx - px.abs(), ry - py.abs())
-    big_x, big_y = (c.detach().view(shape) for c in (f.big_x, f.big_y))
-    return Wavefront(
-        low,
-        step,
-        path.view(shape),
-        density,
-        edge_x,
-        edge_y,
-        big_x,
-        big_y,
-        (~dark).double() if bool(dark.any()) else None,
-        **{name: value.view(shape) for name, value in at.items()},
-    )
+    edge_x, edge_y = pupil.aperture.edges(px, py, (rx, ry))
+    return density, Lit(edge_x, edge_y, (~dark).double() if bool(dark.any()) else None)
 
 
-def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Intercepts, dict[str, Tensor]]:
-    """Intercepts of rays, with their points on the last surface and the sensitivity of the path to its height."""
-    rays, found = [], []
+def _sensitive(optics: Optics, through: tuple[Tensor, Tensor], shape: tuple[int, int]) -> tuple[Intercepts, LastSurface]:
+    """Intercepts of rays through points of the pupil, and the rays at the last surface, as grids of this shape."""
+    (u, v), rays, found = through, [], []
     for start in range(0, len(u), CHUNK):
         m = optics.interactions(u[start : start + CHUNK], v[start : start + CHUNK])
         rays.append(optics.intercepts_of(m))
-        into = m.incoming[2]
+        into = m.hit.incoming[2]
         normal = m.element.pose.axes[2]
         out = sum(c * a for c, a in zip(m.state.full(m.state.direction), normal, strict=True))
-        found.append((m.n_in * into - m.n_out * out, *(c.expand(out.shape) for c in m.local[:2])))
+        found.append((*(c.expand(out.shape) for c in m.hit.local[:2]), m.n_in * into - m.n_out * out))
     f = Intercepts(*(torch.cat([getattr(p, name) for p in rays]) for name in Intercepts.__dataclass_fields__))
-    return f, dict(zip(("sensitivity", "at_x", "at_y"), (torch.cat(c) for c in zip(*found, strict=True)), strict=True))
+    return f, LastSurface(*(torch.cat(c).view(shape) for c in zip(*found, strict=True)))
 
 
 def device_of(optics: Optics) -> torch.device:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from caustic_cli.scene.aperture import Pupil
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.rayset import RaySet
 
@@ -188,41 +189,38 @@ class Source:
         """
         return throw * 2.0 * self.half_angle if self.distant else throw * self._width() / (z_in - self.nearest)
 
-    def cone_over(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
-        """Half-angle of the emission cone about the axis: as given, or the least that covers the aperture, `round` or not, from
-        every point."""
+    def cone_over(self, pupil: Pupil) -> float:
+        """Half-angle of the emission cone about the axis: as given, or the least that covers the pupil from every
+        point."""
         if self.distant:
             return self.half_angle
         if self.cone is not None:
             return math.radians(self.cone)
-        return min(self._covering(half_size, z_in, round) + self.lean, math.pi / 2.0)
+        return min(self._covering(pupil) + self.lean, math.pi / 2.0)
 
-    def _covering(self, half_size: tuple[float, float], z_in: float, round: bool) -> float:
+    def _covering(self, pupil: Pupil) -> float:
         """Largest angle to z, rad, between a point of the source and one of the aperture."""
-        (x, y, z), (rx, ry) = self.points()[0].T, half_size
-        if round:
-            far = self._farthest(x, y) + rx
-        else:
-            far = np.max([self._farthest(x + a, y + b) for a in (-rx, rx) for b in (-ry, ry)], axis=0)
-        return min((1.0 + SLACK) * float(np.arctan2(far, z_in - z).max()), math.pi / 2.0)
+        x, y, z = self.points()[0].T
+        far = pupil.aperture.farthest(self._farthest, x, y)
+        return min((1.0 + SLACK) * float(np.arctan2(far, pupil.z - z).max()), math.pi / 2.0)
 
     def _farthest(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Largest distance from the origin, mm, of the points of a source about (x, y), (k,): of the rectangle of its extent."""
         wide, high = self.extent
         return np.hypot(np.abs(x) + wide, np.abs(y) + high)
 
-    def power_words(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> str:
+    def power_words(self, pupil: Pupil) -> str:
         """What its power, of which all fractions are taken, is: a noun phrase for messages."""
         if self.distant:
             return "the power through the aperture"
-        return f"the power within the cone of {math.degrees(self.cone_over(half_size, z_in, round)):.3g} degrees"
+        return f"the power within the cone of {math.degrees(self.cone_over(pupil)):.3g} degrees"
 
-    def emitted(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> tuple[float, str]:
+    def emitted(self, pupil: Pupil) -> tuple[float, str]:
         """Fraction that its power is of all the light it emits, and what that is, in words: through the aperture for a distant
         source; else its distribution in all directions, except that a uniform one ends at the edge of a cone that is given."""
         if self.distant:
             return 1.0, "through the aperture"
-        cone = self.cone_over(half_size, z_in, round)
+        cone = self.cone_over(pupil)
         if isinstance(self.intensity, Distribution):
             return self.intensity.flux(cone) / self.intensity.flux(math.pi), "in all directions of its table"
         if self.intensity == "lambertian":
@@ -231,11 +229,11 @@ class Source:
             return 1.0, "in its cone"
         return math.sin(0.5 * cone) ** 2, "in all directions, uniform"
 
-    def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
+    def incidence(self, pupil: Pupil) -> float:
         """Upper bound of the angle to z of its rays into the aperture, rad."""
         if self.distant:
             return self.half_angle
-        return min(self.cone_over(half_size, z_in, round) + self.lean, self._covering(half_size, z_in, round))
+        return min(self.cone_over(pupil) + self.lean, self._covering(pupil))
 
     @property
     def lean(self) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from caustic_cli.config.table import check_all
 from caustic_cli.errors import InputError
+from caustic_cli.scene.aperture import Pupil
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.rayset import RaySet
@@ -66,11 +67,11 @@ class Measured(Source):
         """As of a source."""
         return f"{self.rays.count:,} rays of a file"
 
-    def power_words(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> str:
+    def power_words(self, pupil: Pupil) -> str:
         """That of the file's rays, wherever they go."""
         return "the power of all rays of the file"
 
-    def emitted(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> tuple[float, str]:
+    def emitted(self, pupil: Pupil) -> tuple[float, str]:
         """All rays of the file."""
         return 1.0, "by all rays of the file"
 
@@ -86,19 +87,18 @@ class Measured(Source):
         """As of a source, from the point of closest approach."""
         return 2.0 * math.degrees(math.atan2(self._width() / 2.0, abs(z_in - self.centre[2])))
 
-    def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
+    def incidence(self, pupil: Pupil) -> float:
         """As of a source: the largest angle among the rays themselves."""
-        d = self.rays.directions[self.crossing(half_size, z_in, round)[2]]
+        d = self.rays.directions[self.crossing(pupil)[2]]
         return float(np.arctan2(np.hypot(d[:, 0], d[:, 1]), d[:, 2]).max(initial=0.0))
 
-    def crossing(self, half_size: tuple[float, float], z: float, round: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Intersections x, y (N,) mm of the rays with the plane at z, and which rays carry light through an aperture there,
-        (N,)."""
+    def crossing(self, pupil: Pupil) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Intersections x, y (N,) mm of the rays with the plane of a pupil, and which rays carry light through it, (N,)."""
         p, d = self.rays.positions, self.rays.directions
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # rays along the plane, which carry nothing
-            way = (z - self.position[2] - p[:, 2]) / d[:, 2]
+            way = (pupil.z - self.position[2] - p[:, 2]) / d[:, 2]
             x, y = (p[:, k] + self.position[k] + way * d[:, k] for k in (0, 1))
-            inside = x * x + y * y <= half_size[0] ** 2 if round else (np.abs(x) <= half_size[0]) & (np.abs(y) <= half_size[1])
+            inside = pupil.aperture.contains(x, y)
         return x, y, inside & (self.rays.forward > 0)
 
 

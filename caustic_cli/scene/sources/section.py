@@ -28,22 +28,23 @@ DISTANCE, WIDTH, GRID = 5.0, 0.2, (25, 25)
 class Attached(str):
     """A file name in the settings together with the file's content; used as a string it is the name.
 
-    data: the file's bytes; content: the object read from them.
+    data: the file's bytes; content: the object read from them; suffix: of its name in a project.
     """
 
     data: bytes = b""
     content: Any = None
+    suffix: str = ""
 
     @classmethod
-    def of(cls, name: str, data: bytes, content: Any) -> Attached:
+    def of(cls, name: str, data: bytes, content: Any, suffix: str = "") -> Attached:
         """An attached file of that name."""
         found = cls(name)
-        found.data, found.content = data, content
+        found.data, found.content, found.suffix = data, content, suffix
         return found
 
     def named(self, name: str) -> Attached:
         """The same file under another name."""
-        return self.of(name, self.data, self.content)
+        return self.of(name, self.data, self.content, self.suffix)
 
 
 def content(table: Table, key: str, kind: type) -> Any | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.scene.aperture import Pupil
 from caustic_cli.scene.light import Light
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.section import Table
@@ -127,24 +128,24 @@ class Several(Source):
         """The largest; sources at different positions form a picture each."""
         return max(one.blur(z_in, throw) for one in self.members)
 
-    def cone_over(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
+    def cone_over(self, pupil: Pupil) -> float:
         """The widest; a hemisphere where some are distant and others not."""
         if self._near and len(self._near) < len(self.members):
             return math.pi / 2.0
-        return max(one.cone_over(half_size, z_in, round) for one in self.members)
+        return max(one.cone_over(pupil) for one in self.members)
 
-    def power_words(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> str:
+    def power_words(self, pupil: Pupil) -> str:
         """The sum of all."""
         return "the power of all sources"
 
-    def emitted(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> tuple[float, str]:
+    def emitted(self, pupil: Pupil) -> tuple[float, str]:
         """Of all together."""
-        whole = math.fsum(one.power / one.emitted(half_size, z_in, round)[0] for one in self.members)
+        whole = math.fsum(one.power / one.emitted(pupil)[0] for one in self.members)
         return self.power / whole, "by all sources, each in all its directions"
 
-    def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
+    def incidence(self, pupil: Pupil) -> float:
         """The greatest."""
-        return max(one.incidence(half_size, z_in, round) for one in self.members)
+        return max(one.incidence(pupil) for one in self.members)
 
 
 def lights_of(section: Table, color: bool = False) -> list[Light]:

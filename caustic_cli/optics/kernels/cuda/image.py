@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import axial_refraction, filter_weights, fused, pixels
 from caustic_cli.optics.kernels import oblique_refraction as oblique
-from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
+from caustic_cli.optics.kernels.arguments import Exit, ScreenFrame, Splat
 from caustic_cli.optics.kernels.axial_refraction import (
     BY_POWER,
     BY_PX,
@@ -56,18 +56,18 @@ aim_batch, pull_batch, push_oblique = device(oblique._aim), device(oblique._pull
 VECTORS = axial_refraction.VECTORS + axial_refraction.SCRATCH
 
 
-class Setting(NamedTuple):
-    """Scalar arguments of a kernel: index and kind of Fresnel losses, as of an `Exit`, a `Frame`, and alpha of the filter."""
+class ImageArguments(NamedTuple):
+    """Scalar arguments of a kernel: index and kind of Fresnel losses, as of an `Exit`, a `ScreenFrame`, and alpha of the filter."""
 
     index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
     fresnel: int
-    frame: Frame
+    frame: ScreenFrame
     alpha_x: float
     alpha_y: float
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class LitRays:
     """Rays below the exit, (N,) each on the device: origins, mm, transverse direction components, and powers.
 
     oblique: whether they have individual directions; otherwise all are parallel to z, and `along` is empty.
@@ -237,16 +237,16 @@ class Splatting(NamedTuple):
     """All inputs except the intersections: light, unit of its sums, start and height of the `Exit` (2,), kernels and their
     arguments."""
 
-    light: Light
+    light: LitRays
     unit: Tensor
     place: Tensor
-    setting: Setting
+    setting: ImageArguments
     kernels: tuple
     shape: tuple[int, int]
 
 
 def expose(
-    hits, light: Light, unit: Tensor, place: Tensor, eta: float, fresnel: str, screen: Screen, filter: Filter
+    hits, light: LitRays, unit: Tensor, place: Tensor, eta: float, fresnel: str, screen: Screen, filter: Filter
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """The image of rays, from where they meet the exit.
 
@@ -260,8 +260,8 @@ def expose(
     """
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     vx, vy, kind = 2 * rx + 1, 2 * ry + 1, filter_weights.KINDS[filter.kind]
-    frame = Frame(int(nx), int(ny), *map(float, screen.low), *map(float, screen.pixel))
-    setting = Setting(float(eta), axial_refraction.FRESNEL[fresnel], frame, *map(float, filter.alpha))
+    frame = ScreenFrame(int(nx), int(ny), *map(float, screen.low), *map(float, screen.pixel))
+    setting = ImageArguments(float(eta), axial_refraction.FRESNEL[fresnel], frame, *map(float, filter.alpha))
     shape = (nx + 4 * rx, ny + 4 * ry + -vy % 4)  # with room for the gather's steps of four pixels
     how = Splatting(light, unit, place, setting, _kernels(light.oblique, kind, vx, vy), shape)
     padded, leaving, ledger = _Image.apply(*hits, how)

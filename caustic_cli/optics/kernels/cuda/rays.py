@@ -89,7 +89,7 @@ def _land_tangent(count, ray, surface, along, out):
         land_push(v, k, 1, ray, surface, along, out)
 
 
-class Stage(NamedTuple):
+class RayStage(NamedTuple):
     """Kernels, number of output components besides a boolean one, and further arguments of the kernels."""
 
     forward: object
@@ -102,26 +102,26 @@ class Stage(NamedTuple):
 def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, field=None):
     """`kernels.interact.interact` of tensors on the device."""
     if reflects:
-        *t, passes = _Stage.apply(Stage(_reflect, _reflect_adjoint, _reflect_tangent, 3, ()), *direction, *slopes)
+        *t, passes = _Stage.apply(RayStage(_reflect, _reflect_adjoint, _reflect_tangent, 3, ()), *direction, *slopes)
         return tuple(t), power, passes
     polarised = field is not None and fresnel == "exact"
     surface = refraction.Interface(float(eta), FRESNEL[fresnel], polarised)
-    stage = Stage(_refract, _refract_adjoint, _refract_tangent, 4, surface)
+    stage = RayStage(_refract, _refract_adjoint, _refract_tangent, 4, surface)
     *t, after, passes = _Stage.apply(stage, *direction, *slopes, power, *(field if polarised else (0.0, 0.0, 0.0)))
     return tuple(t), after, passes
 
 
 def land(origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
     """`kernels.transfer.land` of tensors on the device."""
-    plane = transfer.Plane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
-    return _Stage.apply(Stage(_land, _land_adjoint, _land_tangent, 2, plane), *origin, *direction)
+    plane = transfer.TargetPlane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
+    return _Stage.apply(RayStage(_land, _land_adjoint, _land_tangent, 2, plane), *origin, *direction)
 
 
 class _Stage(torch.autograd.Function):
     """A stage and a ray's components, tensors (N,) or numbers for all rays -> its outputs."""
 
     @staticmethod
-    def forward(stage: Stage, *ray):
+    def forward(stage: RayStage, *ray):
         like = _like(ray)
         out = tuple(torch.empty_like(like) for _ in range(stage.outputs))
         held = torch.empty(like.shape, dtype=torch.bool, device=like.device)
@@ -156,7 +156,7 @@ class _Pushed(torch.autograd.Function):
     """The tangent of `_Stage`, a separate function because within torch.func the data of a tensor is accessible only there."""
 
     @staticmethod
-    def forward(stage: Stage, *values):
+    def forward(stage: RayStage, *values):
         ray, along, like = values[: len(values) // 2], values[len(values) // 2 :], _like(values)
         out = tuple(torch.empty_like(like) for _ in range(stage.outputs))
         start(stage.tangent, len(like), len(like), _components(ray, like), stage.surface, _components(along, like), out)

@@ -18,7 +18,7 @@ from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.launch import device, start
 from caustic_cli.optics.kernels.cuda.scatter import scatter, scatter_tangent, size_of_tangent, units
 from caustic_cli.optics.kernels.filter_weights import KINDS
-from caustic_cli.optics.kernels.splat import BY_W, BY_X, BY_Y, LEAN_X, LEAN_Y, OVER_X, OVER_Y, PX, PY, Frame, W
+from caustic_cli.optics.kernels.splat import BY_W, BY_X, BY_Y, LEAN_X, LEAN_Y, OVER_X, OVER_Y, PX, PY, PixelFrame, W
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
@@ -31,7 +31,7 @@ def splat_rays(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Fil
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     (low_x, low_y), (wide_x, wide_y), (alpha_x, alpha_y) = (map(float, pair) for pair in (screen.low, screen.pixel, filter.alpha))
     kernel = KINDS[filter.kind], 2 * rx + 1, 2 * ry + 1
-    frame = Frame(int(nx), int(ny), low_x, low_y, wide_x, wide_y, *kernel, alpha_x, alpha_y)
+    frame = PixelFrame(int(nx), int(ny), low_x, low_y, wide_x, wide_y, *kernel, alpha_x, alpha_y)
     padded, outside = _Splat.apply(x, y, weight, frame)
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the gather's steps up to four pixels
     return padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny], outside + padding(padded, filter.reach)
@@ -54,7 +54,7 @@ def _kernels(kind: int, vx: int, vy: int):
     @cuda.jit
     def forward(rays, any_frame, unit, image, outside):
         (x, y, weight), f = rays, any_frame
-        frame = Frame(f.pixels_x, f.pixels_y, f.low_x, f.low_y, f.wide_x, f.wide_y, kind, vx, vy, f.alpha_x, f.alpha_y)
+        frame = PixelFrame(f.pixels_x, f.pixels_y, f.low_x, f.low_y, f.wide_x, f.wide_y, kind, vx, vy, f.alpha_x, f.alpha_y)
         v, none = cuda.local.array((VECTORS, 1), float64), cuda.local.array((1, 1), float64)
         sx, sy, total = cuda.local.array((vx, 1), float64), cuda.local.array((vy, 1), float64), 0
         for k in range(cuda.grid(1), len(x), cuda.gridsize(1)):
@@ -69,7 +69,7 @@ def _kernels(kind: int, vx: int, vy: int):
     @cuda.jit
     def adjoint(rays, any_frame, grad, by_outside, out):
         (x, y, weight), (by_x, by_y, by_w), f = rays, out, any_frame
-        frame = Frame(f.pixels_x, f.pixels_y, f.low_x, f.low_y, f.wide_x, f.wide_y, kind, vx, vy, f.alpha_x, f.alpha_y)
+        frame = PixelFrame(f.pixels_x, f.pixels_y, f.low_x, f.low_y, f.wide_x, f.wide_y, kind, vx, vy, f.alpha_x, f.alpha_y)
         v = cuda.local.array((VECTORS, 1), float64)
         sx, dx = cuda.local.array((vx, 1), float64), cuda.local.array((vx, 1), float64)
         sy, dy = cuda.local.array((vy, 1), float64), cuda.local.array((vy, 1), float64)
@@ -85,7 +85,7 @@ def _kernels(kind: int, vx: int, vy: int):
     def tangent(rays, along, any_frame, unit, sizes, image, outside):
         """Each ray's part of the bound into `sizes`; or, where that is empty, adds to `image` and `outside` in units."""
         (x, y, weight), (d_x, d_y, d_w), f = rays, along, any_frame
-        frame = Frame(f.pixels_x, f.pixels_y, f.low_x, f.low_y, f.wide_x, f.wide_y, kind, vx, vy, f.alpha_x, f.alpha_y)
+        frame = PixelFrame(f.pixels_x, f.pixels_y, f.low_x, f.low_y, f.wide_x, f.wide_y, kind, vx, vy, f.alpha_x, f.alpha_y)
         v = cuda.local.array((VECTORS, 1), float64)
         sx, dx = cuda.local.array((vx, 1), float64), cuda.local.array((vx, 1), float64)
         sy, dy = cuda.local.array((vy, 1), float64), cuda.local.array((vy, 1), float64)
@@ -107,7 +107,7 @@ def _kernels(kind: int, vx: int, vy: int):
     return forward, adjoint, tangent
 
 
-def _shape(frame: Frame) -> tuple[int, int]:
+def _shape(frame: PixelFrame) -> tuple[int, int]:
     """Of a padded image, with room for the gather's last step of four pixels."""
     return frame.pixels_x + 2 * (frame.size_x - 1), frame.pixels_y + 2 * (frame.size_y - 1) + -frame.size_y % 4
 
@@ -120,7 +120,7 @@ class _Splat(torch.autograd.Function):
     """x, y, weight and the frame -> padded image, the weight outside ()."""
 
     @staticmethod
-    def forward(x: Tensor, y: Tensor, weight: Tensor, frame: Frame):
+    def forward(x: Tensor, y: Tensor, weight: Tensor, frame: PixelFrame):
         rays, image = _whole((x, y, weight)), torch.zeros(_shape(frame), dtype=torch.int64, device=x.device)
         unit, outside = sums.unit_of(rays[2].abs().sum()), image.new_zeros(1)
         start(_kernels(*frame[6:9])[0], len(x), rays, frame, unit, image, outside)
@@ -151,7 +151,7 @@ class _Pushed(torch.autograd.Function):
     """The tangent of `_Splat`, a separate function because within torch.func the data of a tensor is accessible only there."""
 
     @staticmethod
-    def forward(frame: Frame, *values):
+    def forward(frame: PixelFrame, *values):
         rays, along = _whole(values[:3]), _whole(values[3:])
         image = torch.zeros(_shape(frame), dtype=torch.int64, device=rays[0].device)
         sizes, outside, kernel = torch.zeros_like(rays[0]), image.new_zeros(1), _kernels(*frame[6:9])[2]

@@ -34,7 +34,7 @@ enter_alone, units = device(ray_intersections.enter_alone), device(sums.units)
 ROUNDING = 1e-3
 
 
-class Axis(NamedTuple):
+class PolynomialAxis(NamedTuple):
     """One axis of the polynomials: of `spline.Axis` matrices (I, p + 1, p + 1) and geometry, and the control points (I, p + 1) that
     each piece takes, all on the device."""
 
@@ -45,7 +45,7 @@ class Axis(NamedTuple):
     inverse: Tensor
 
     @classmethod
-    def of(cls, space: SplineSpace, place: torch.device) -> Axis:
+    def of(cls, space: SplineSpace, place: torch.device) -> PolynomialAxis:
         """On a device."""
         axis = spline.axis(space)
         control = torch.from_numpy(axis.first)[:, None] + torch.arange(space.degree + 1)
@@ -75,7 +75,7 @@ class DeviceSurface:
     def __init__(self, spaces: tuple[SplineSpace, SplineSpace], half_size: tuple[float, float], place: torch.device):
         self.shape = tuple(s.n for s in spaces)
         self.scale = (0.5 / half_size[0], 0.5 / half_size[1])
-        self.u, self.v = (Axis.of(s, place) for s in spaces)
+        self.u, self.v = (PolynomialAxis.of(s, place) for s in spaces)
         self.geometry = (*self.u[2:], *self.v[2:])
         self.spaces = spaces
         #: d xi / dx and d eta / dy in the narrowest piece, per mm.

@@ -1,0 +1,52 @@
+"""The lowering of a trace to one fused kernel: the only place that knows which systems it covers.
+
+It takes the rays in front of the last surface, a single upright B-spline at the origin in front of an upright screen, where nothing
+but refraction with Fresnel losses happens to them; see `backends`.
+"""
+
+from __future__ import annotations
+
+from typing import TypeGuard
+
+from caustic_cli.optics.backends import Fused
+from caustic_cli.optics.frames import Pose
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.system import Element, PlacedScreen
+from caustic_cli.scene import Pupil, Screen
+
+
+def lowered(tracer, before: Fused | None) -> Fused | None:
+    """The rest of a tracer's system as one fused kernel; None where it does not apply.  before: that of the previous chunk, whose
+    prepared arrays are reused."""
+    system, start, (inside, outside) = tracer.system, tracer.start, tracer.media[-2:]
+    element, pupil = system.elements[-1], system.pupil
+    surface = element.surface
+    asked = tracer.requests.stages or tracer.actions or tracer.track or any(medium.varies for medium in tracer.media)
+    if asked or tracer.first != len(system.elements) - 1 or not _is_plain(element, pupil):
+        return None
+    if start.polarised is not None or not isinstance(start.origin[2], float) or not (system.lit or tracer.first):
+        return None
+    eta = inside.index_at(start.wavelength) / outside.index_at(start.wavelength)
+    if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface
+        return None
+    if tracer.sides[-1] < 0 or (start.along_axis and element.aperture != pupil.aperture):
+        return None
+    if start.along_axis:
+        return tracer.backend.plane_image(surface, start, eta, element.fresnel, before)
+    return tracer.backend.ray_image(surface, start, eta, element.fresnel, element.aperture.radius, before)
+
+
+def _is_plain(element: Element, pupil: Pupil) -> bool:
+    """Whether an element is a refracting B-spline over the pupil, upright at the origin."""
+    surface = element.surface
+    return (
+        isinstance(surface, HeightField)
+        and not element.reflects
+        and element.pose == Pose()
+        and element.aperture.half_size == surface.half_size == pupil.half_size
+    )
+
+
+def covers(screen: Screen | PlacedScreen) -> TypeGuard[Screen]:
+    """Whether the fused kernels splat onto such a screen."""
+    return isinstance(screen, Screen) and screen.upright

@@ -1,0 +1,83 @@
+"""Transparent media, which carry rays from surface to surface: refractive index by wavelength, and absorption.
+
+A medium whose index varies with position is a subclass (`gradient.medium`): it curves the rays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import ClassVar
+
+from torch import Tensor
+
+from caustic_cli.config import checks
+from caustic_cli.optics.ray_transfer import meet
+from caustic_cli.optics.rays import RayState
+from caustic_cli.scene import Lens
+from caustic_cli.scene.materials import refractive_index
+
+
+@dataclass(frozen=True)
+class Medium:
+    """A homogeneous medium.
+
+    Args:
+        index: refractive index; for a glass, that of rays without a wavelength.
+        absorption: absorption coefficient a, 1/mm; the transmittance of t mm is exp(-a t) (Beer-Lambert).
+        glass: a dispersive material, by its name in `materials`; None for `index` at every wavelength.
+
+    varies: whether the index varies with position.
+    """
+
+    index: float = 1.0
+    absorption: float = 0.0
+    glass: str | None = None
+
+    varies: ClassVar[bool] = False
+
+    def __post_init__(self):
+        checks.number("index", self.index, 1.0, 5.0)
+        checks.number("absorption", self.absorption, 0.0, 1e6)
+
+    def index_at(self, wavelength: float | None) -> float:
+        """Refractive index at a wavelength, nm."""
+        return self.index if self.glass is None or wavelength is None else refractive_index(self.glass, wavelength)
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """Names of the effects on rays that it causes."""
+        return frozenset({"absorption"} if self.absorption else ())
+
+    def variation(self, half_size: tuple[float, float], depth: float) -> tuple[float, float, float]:
+        """Bounds over a box of half widths `half_size` and of this depth, mm, behind its first surface: least and largest index,
+        relative to `index`, and largest |grad n|, 1/mm."""
+        return 1.0, 1.0, 0.0
+
+    def check_first(self) -> None:
+        """Check that it may lie in front of the first element of a system.
+
+        Raises:
+            InputError: it needs an element that defines its frame.
+        """
+
+    def entering(self, rays: RayState) -> RayState:
+        """Rays in the form in which it takes them."""
+        return rays
+
+    def carry(self, tracer, m, heights: Tensor | None, parameters) -> None:
+        """Transfer the rays of an `Interaction` through it to the surface, of these heights: along straight lines."""
+        meet(tracer, m, heights)
+
+    def receive(self, tracer, m, parameters) -> None:
+        """Set the refractive index behind the surface of an `Interaction` where it depends on the point of intersection."""
+
+
+AIR = Medium()
+
+
+def medium_of(lens: Lens) -> Medium:
+    """The medium inside a lens."""
+    if lens.gradient is None:
+        return Medium(lens.index, lens.absorption, lens.glass)
+    return import_module("caustic_cli.optics.gradient.medium").GradientMedium.of(lens)  # loaded where a lens has one

@@ -1,0 +1,117 @@
+"""Ray transfer along straight lines to the next surface of a trace.
+
+Rays of a plane wave in front of the first free-form surface, and other rays that do not depend on heights, meet that surface by a
+function prepared once for all heights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.frames import advance, to_global, to_local
+from caustic_cli.optics.rays import Hit, RayState
+from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
+from caustic_cli.scene import Aperture
+
+
+def meet(tracer, m, heights: Tensor | None) -> None:
+    """Transfer the rays of an `Interaction` to its surface, of these heights."""
+    element, system = m.element, tracer.system
+    prepared = tracer.prepared_intersection if m.state is getattr(tracer, "start", None) else None  # valid for these rays only
+    state = replace(m.state, lost=dict(m.state.lost))
+    if m.index == tracer.first and m.forward and heights is not None:
+        state = state.counted_from(element.pose.position[2] + element.surface.centred(heights)[1])
+    if _at_pupil(system, m):
+        state = tracer.media[m.beyond].entering(state)
+        o, d = to_local(element.pose, state.origin, state.direction, state.datum)
+        m.state, m.hit = state, Hit(o, d, (0.0, 0.0))
+        return
+    state = state.expanded()
+    o, d = to_local(element.pose, state.origin, state.direction, state.datum)
+    if m.index == 0 and m.forward and prepared is None and system.lit is None and not element.surface.flat:
+        o, state = _moved_before_surface(tracer, o, d, state, element, heights)
+    hit = next((h for a in tracer.actions if (h := a.intersect(m, o, d, heights)) is not None), None)
+    if hit is None:
+        hit = prepared(heights) if prepared else element.surface.intersect(heights, o, d, m.side)
+    if state.power.dtype != tracer.dtype:  # the first intersection is always computed in float64
+        t, gx, gy = (_cast(c, tracer.dtype) for c in hit[:3])
+        state, hit = state.to(tracer.dtype), SurfaceIntersection(t, gx, gy, hit.found)
+        o, d = (tuple(_cast(c, tracer.dtype) for c in v) for v in (o, d))
+    m.hit = Hit(advance(o, d, hit.t), d, (hit.gx, hit.gy), hit.t)
+    if (
+        prepared is None or state.sample is None or not _is_pupil(element, system)
+    ):  # a sample of the same aperture lies on the surface
+        tracer.keep(state, _passed(element, m.hit, hit.found))
+    state.origin = to_global(element.pose, m.hit.local, state.datum)
+    state.path = state.path + m.n_in * hit.t
+    m.state = state
+
+
+def _at_pupil(system, m) -> bool:
+    """Whether the rays lie on this plane first element already, without any that miss it, as their source emits them."""
+    e, pupil, z = m.element, system.pupil, m.state.origin[2]
+    if m.index or not m.forward or not isinstance(z, float) or z + m.state.datum != pupil.z:
+        return False
+    return e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z) and _is_pupil(e, system)
+
+
+def _is_pupil(element, system) -> bool:
+    """Whether an element's aperture is that of the pupil."""
+    return element.aperture == system.pupil.aperture
+
+
+def _passed(element, hit: Hit, found: Tensor) -> Tensor:
+    """Which of the rays `found` to meet an element's surface are within its aperture."""
+    if element.aperture != Aperture(element.surface.half_size):
+        found = found & element.aperture.contains(*hit.local[:2])
+    return found
+
+
+def _moved_before_surface(tracer, o, d, state: RayState, element, heights) -> tuple[tuple, RayState]:
+    """Rays on a pupil that intersects the first surface, moved back in front of it."""
+    low = element.surface.hull(heights)[0]
+    back = max(0.0, float(torch.as_tensor(o[2], dtype=torch.float64).max()) - low)
+    if back == 0.0:
+        return o, state
+    way = -back * (1.0 + 1e-9) / d[2]
+    moved = (torch.as_tensor(c + way * v, dtype=torch.float64) for c, v in zip(o, d, strict=True))
+    path = state.path + tracer.media[0].index_at(state.wavelength) * way
+    return tuple(c.expand(state.power.shape) for c in moved), replace(state, path=path)
+
+
+def prepared_intersection(tracer):
+    """Intersections of a tracer's rays `start` with the first free surface as a prepared function of its heights; None if that case
+    is not covered."""
+    system, first, start = tracer.system, tracer.first, tracer.start
+    if first == len(system.elements) or "intersection" in tracer.requests.off:
+        return None
+    element = system.elements[first]
+    surface, pupil = element.surface, system.pupil
+    if not isinstance(surface, HeightField) or tracer.sides[first] < 0 or not element.pose.upright:
+        return None
+    if first == 0 and system.lit is None and start.sample is None:
+        return None
+    px, py, pz = element.pose.position
+    centred = (px, py) == (0.0, 0.0)
+    on_axis = start.sample is not None and start.direction == (0.0, 0.0, 1.0)
+    if on_axis and centred and surface.half_size == pupil.half_size:
+        evaluate = tracer.backend.spline_on(surface, start.sample, tracer.dtype)
+
+        def sampled(heights: Tensor) -> SurfaceIntersection:
+            sag, gx, gy = evaluate(surface.centred(heights)[0])
+            below = start.origin[2] - pz - float(heights.detach().double().mean()) - start.datum
+            found = torch.ones((), dtype=torch.bool, device=sag.device).expand(sag.shape)
+            return SurfaceIntersection(sag - below, gx, gy, found)
+
+        return sampled
+    spread = start.expanded()
+    full = spread.full((*spread.origin, *spread.direction))
+    origin = (full[0] - px, full[1] - py, full[2] + (start.datum - pz))
+    return tracer.backend.intersect_fixed(surface, origin, full[3:])
+
+
+def _cast(value, dtype: torch.dtype):
+    return value.to(dtype) if isinstance(value, Tensor) else value

@@ -1,0 +1,87 @@
+"""A new project from a picture and the user's settings: a preset, a configuration, options."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from caustic_cli.config import presets, settings
+from caustic_cli.config.completion import complete
+from caustic_cli.config.settings import Given, Settings
+from caustic_cli.config.table import Parameters, TargetSettings
+from caustic_cli.config.wave_stages import without_waves
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.scene_parameters import Ranges
+from caustic_cli.io.files import Piped
+from caustic_cli.io.picture import Picture, read_picture
+from caustic_cli.optics.obstruction import clear_shift
+from caustic_cli.project import attachments, uptodate
+from caustic_cli.project.project import Project
+
+
+def new_project(
+    target: Path | Piped | Picture,
+    given: Mapping[str, Any],
+    preset: str | None,
+    config: Path | None,
+    out: Path | None,
+    say: Callable[[str], None],
+) -> tuple[Project, Given]:
+    """A project, of which nothing is written yet, and the settings that were given, by section.
+
+    Args:
+        given: path in `config.table` -> value, including derived parameters such as "mag".
+        preset: a name of `config.presets`, whose settings are overridden by those of config.
+        config: a TOML file of further settings, which are overridden by those `given`.
+        out: its directory; None for a project in memory.
+
+    Raises:
+        InputError: invalid input.
+    """
+    said = _merged(given, preset, config, say)
+    parameters = Parameters(said.pop("", {}))
+    if parameters.elements is not None:  # those of the command line replace those of a configuration
+        said["element"] = {"list": list(parameters.elements)}
+    goal = TargetSettings.of(said.get("target", {}))
+    picture = (
+        target if isinstance(target, Picture) else read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
+    )
+    if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
+        del said["source"]["weights"]
+    if goal.color:
+        if isinstance(target, Picture):
+            raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
+        light = [float(c) for c in picture.irradiance().sum((1, 2))]
+        said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
+    full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
+    for key in ("index_range", "index_control", "index_layers"):
+        if f"lens.{key}" in given and full.lens.gradient != "free":
+            raise InputError(f"⟨lens.{key}⟩ belongs to ⟨+lens.gradient⟩ free")
+    if full.lens.mirror and "shift" not in full.screen and any(shift := _beside_the_light(full)):
+        said["screen"] = said.get("screen", {}) | {"shift": list(shift)}
+        full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
+        say(f"the screen is shifted by {shift[0]:g},{shift[1]:g} mm, beside the light of its source; ⟨+screen.shift⟩ places it")
+    settings.refuse_unused(full.source, given, [stage.source for stage in full.design.stages])
+    full = full.changed(target=full.target.changed(file=f"target{picture.suffix}", encoding=picture.encoding))
+    full = attachments.named_in_project(full)
+    asked = uptodate.digest(full, picture)
+    return Project(out, full, picture, asked, without_waves=without_waves(full, "stages" in said.get("design", {}))), said
+
+
+def _merged(given: Mapping[str, Any], preset: str | None, config: Path | None, say: Callable[[str], None]) -> Given:
+    """The settings of preset, configuration and command line, with the contents of the files they name."""
+    layers = [settings.read(presets.path_of(preset), parameters=True)] if preset else []
+    if config:
+        layers.append(attachments.located(settings.read(config, parameters=True), config.parent))
+    said = settings.merged({}, *map(settings.implied, (*layers, settings.by_section(given))))
+    if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given at the same level
+        glass = said["lens"].pop("glass")
+        say(f"⟨lens.index⟩ {said['lens']['index']:g} is used at all wavelengths, and {glass} is ignored")
+    return attachments.attached(said)
+
+
+def _beside_the_light(full: Settings) -> tuple[float, float]:
+    """Shift (x, y) mm of a mirror's screen with which it is nowhere in the light of its source; 0 if there is none."""
+    scene, over = settings.build_scene(full), Ranges.parse(full.design.over)
+    return clear_shift([scene] if over is None else over.ends(scene)) or (0.0, 0.0)
