@@ -1,0 +1,44 @@
+"""Which effects are simulated and why, and what each costs and changes."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Self
+
+from caustic_cli.studies import effects
+from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.outputs.base import Output, Rendering
+
+
+class Explanation(Output):
+    """The table of effects."""
+
+    beyond: ClassVar[bool] = True
+
+    @classmethod
+    def of(cls, options: Any) -> Self | None:
+        """By the option `explain`."""
+        return cls() if options.explain else None
+
+    @property
+    def asks(self) -> dict[str, object]:
+        """The table."""
+        return {"explain": True}
+
+    def write(self, rendering: Rendering) -> dict[str, Any]:
+        """effects: a row for each, see `studies.effects.explain`."""
+        lens = rendering.lens
+        compile_for(None, rendering.device, rendering.say)
+        rows = effects.explain(
+            rendering.plan,
+            lens.scene,
+            lens.field,
+            lens.heights.to(rendering.device),
+            rays=min(rendering.count, effects.RAYS),
+            seed=rendering.seed,
+            dtype=rendering.asked.tracing.dtype,
+        )
+        return {"effects": rows}
+
+    def show(self, figures: dict[str, Any], say: Any) -> None:
+        """Print the table."""
+        say.result(*effects.table(figures["effects"]))
