@@ -88,16 +88,7 @@ def run(asked: ConvergenceOptions) -> None:
     """Measure errors and computing times for many settings."""
     began, say = time.monotonic(), asked.say
     kinds, rays = _kinds(asked), options.rays("--rays", asked.rays) if asked.rays else None
-    given: dict[str, Any] = {"seconds": asked.seconds, "repeats": asked.repeats, "dtype": asked.dtype}
-    for option, value in given.items():
-        if value is not None and not any(option in kind.takes for kind in kinds):
-            raise InputError(f"--{option} has no meaning for --study {asked.study}: leave it out")
-    given["dtype"] = options.dtype_of(asked.dtype) if asked.dtype else None
-    output = asked.output
-    if (output.exists() or output.is_symlink()) and not output.is_dir():
-        raise InputError(f"{output}: is no directory; a directory for CSV, JSON and PNG is needed")
-    if asked.project is not None:
-        options.require_project(asked.project)
+    given, output = _given(asked, kinds), asked.output
     device = asked.start_torch()
 
     from caustic_cli.studies import report  # noqa: PLC0415
@@ -119,6 +110,24 @@ def run(asked: ConvergenceOptions) -> None:
     if asked.json:
         whole = {"study": "all", "studies": done, "seconds": time.monotonic() - began}
         console.emit_json(done[0] if len(kinds) == 1 else whole)
+
+
+def _given(asked: ConvergenceOptions, kinds: list[StudyKind]) -> dict[str, Any]:
+    """The options that apply to some studies only.
+
+    Raises:
+        InputError: one applies to none of these, there is no such precision, or something stands in the place of the directory.
+    """
+    given: dict[str, Any] = {"seconds": asked.seconds, "repeats": asked.repeats, "dtype": asked.dtype}
+    for option, value in given.items():
+        if value is not None and not any(option in kind.takes for kind in kinds):
+            raise InputError(f"--{option} has no meaning for --study {asked.study}: leave it out")
+    given["dtype"] = options.dtype_of(asked.dtype) if asked.dtype else None
+    if (asked.output.exists() or asked.output.is_symlink()) and not asked.output.is_dir():
+        raise InputError(f"{asked.output}: is no directory; a directory for CSV, JSON and PNG is needed")
+    if asked.project is not None:
+        options.require_project(asked.project)
+    return given
 
 
 def _kinds(asked: ConvergenceOptions) -> list[StudyKind]:

@@ -33,7 +33,7 @@ TAKERS: dict[str, Sequence[str]] = {
 }
 
 
-class ExportOptions(options.Given):
+class ExportOptions(options.OfDesign, options.Debugging):
     """Arguments and options of caustic export."""
 
     project: Annotated[
@@ -98,11 +98,6 @@ class ExportOptions(options.Given):
             help="lighttools: also write a Python script for its COM interface and an .lts point block that rebuild the scene.",
         ),
     ] = False
-    at: options.At = None
-    force: options.Force = False
-    json: options.Json = False
-    quiet: options.Quiet = False
-    debug: options.Debug = False
 
 
 def run(asked: ExportOptions) -> None:
@@ -160,13 +155,7 @@ def _given(asked: ExportOptions, formats: list[str]) -> dict[str, Any]:
     Raises:
         InputError: one applies to none of the formats, is out of range, or contradicts another.
     """
-    said = {name: getattr(asked, name) for name in TAKERS if name != "milling"}
-    for name, value in (said | asked.milling).items():
-        takers = TAKERS.get(name, TAKERS["milling"])
-        if value is not None and value is not False and not set(takers) & set(formats):
-            what = " (a spline, or a path along it, has no samples)" if name == "samples" else ""
-            option = f"--{name.replace('_', '-')}"
-            raise InputError(f"{option} belongs to --format {alternatives(takers)}, got {', '.join(formats)}{what}")
+    _check_takers(asked, formats)
     if asked.block is not None and not 0 < asked.block < 1e6:
         raise InputError(f"--block must be greater than 0 mm, got {asked.block:g}")
     _check_milling(asked.milling)
@@ -180,6 +169,17 @@ def _given(asked: ExportOptions, formats: list[str]) -> dict[str, Any]:
         "milling": asked.milling or None,
     }
     return {name: value for name, value in given.items() if value is not None}
+
+
+def _check_takers(asked: ExportOptions, formats: list[str]) -> None:
+    """Check that every option given applies to one of the formats."""
+    said = {name: getattr(asked, name) for name in TAKERS if name != "milling"}
+    for name, value in (said | asked.milling).items():
+        takers = TAKERS.get(name, TAKERS["milling"])
+        if value is not None and value is not False and not set(takers) & set(formats):
+            what = " (a spline, or a path along it, has no samples)" if name == "samples" else ""
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{option} belongs to --format {alternatives(takers)}, got {', '.join(formats)}{what}")
 
 
 def _check_milling(given: dict[str, Any]) -> None:

@@ -20,10 +20,10 @@ EXAMPLES = """Examples:
 """
 
 
-class GradmapOptions(options.Given):
+class GradmapOptions(options.OfDesign, options.OnDevice):
     """Arguments and options of caustic gradmap."""
 
-    project: options.Project
+    project: Annotated[Path, typer.Argument(help="Project directory made by caustic design.", show_default=False)]
     control: Annotated[
         list[str] | None,
         typer.Option(
@@ -48,15 +48,6 @@ class GradmapOptions(options.Given):
         Path | None,
         typer.Option(metavar="FILE", help="Also write the derivative, fractions of the source's power per mm, float64, [i, j]."),
     ] = None
-    at: options.At = None
-    force: options.Force = False
-    json: options.Json = False
-    quiet: options.Quiet = False
-    seed: options.Seed = None
-    device: options.Device = "auto"
-    dtype: options.Dtype = None
-    threads: options.Threads = None
-    debug: options.Debug = False
 
 
 def run(asked: GradmapOptions) -> None:
@@ -65,7 +56,7 @@ def run(asked: GradmapOptions) -> None:
     count, size = options.rays("--rays", asked.rays), options.both(options.counts("--filter-size", asked.filter_size))
     points = [options.indices("--control", text) for text in asked.control or []]
     options.require_project(asked.project)
-    device = options.start_torch(asked.device, asked.threads, say)
+    device = asked.start_torch()
 
     from caustic_cli.config.completion import filter_from  # noqa: PLC0415
     from caustic_cli.io.picture import write_npy  # noqa: PLC0415

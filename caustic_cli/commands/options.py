@@ -30,10 +30,6 @@ LISTS = {
 }
 #: Parameters of mallopt(3), from glibc's malloc.h.
 TRIM_THRESHOLD, MMAP_MAX = -1, -4
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout instead of the table.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Print nothing on stderr except errors.")]
-Debug = Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
 At = Annotated[
     str | None,
     typer.Option(
@@ -41,25 +37,6 @@ At = Annotated[
         help="For a network trained --over a range: the lens for this value, like throw=300 (mm).  [default: the middle]",
     ),
 ]
-Seed = Annotated[
-    int | None,
-    typer.Option(envvar="CAUSTIC_SEED", help="Seed of all random numbers; the same seed gives the same bytes.  [default: 0]"),
-]
-Device = Annotated[str, typer.Option(envvar="CAUSTIC_DEVICE", help="auto, cpu or cuda.")]
-Dtype = Annotated[
-    str | None,
-    typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU kernels always use float64."),
-]
-Threads = Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")]
-Progress = Annotated[
-    str,
-    typer.Option(
-        envvar="CAUSTIC_PROGRESS",
-        metavar="auto|json",
-        help="json: print JSON on stderr, one object per line, including the progress; errors stay plain text.",
-    ),
-]
-Project = Annotated[Path, typer.Argument(help="Project directory made by caustic design.", show_default=False)]
 
 
 class Given:
@@ -83,22 +60,62 @@ class Given:
         return Reporter(self.quiet, self.progress, self.json)
 
 
-class Computation(Given):
-    """Options of all commands that compute for long."""
+class Presentation(Given):
+    """Options of all commands: what they print and write."""
 
-    force: Force = False
-    json: Json = False
-    quiet: Quiet = False
-    progress: Progress = "auto"
-    seed: Seed = None
-    device: Device = "auto"
-    dtype: Dtype = None
-    threads: Threads = None
-    debug: Debug = False
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False
+    json: Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout instead of the table.")] = False
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Print nothing on stderr except errors.")] = (
+        False
+    )
+
+
+class OfDesign(Presentation):
+    """Options of the commands that take the lens of a project as it is."""
+
+    at: At = None
+
+
+class WithProgress(Given):
+    """The option of the commands that show their progress."""
+
+    progress: Annotated[
+        str,
+        typer.Option(
+            envvar="CAUSTIC_PROGRESS",
+            metavar="auto|json",
+            help="json: print JSON on stderr, one object per line, including the progress; errors stay plain text.",
+        ),
+    ] = "auto"
+
+
+class Debugging(Given):
+    """The last option of all commands."""
+
+    debug: Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")] = False
+
+
+class OnDevice(Debugging):
+    """Options of the commands that trace rays."""
+
+    seed: Annotated[
+        int | None,
+        typer.Option(envvar="CAUSTIC_SEED", help="Seed of all random numbers; the same seed gives the same bytes.  [default: 0]"),
+    ] = None
+    device: Annotated[str, typer.Option(envvar="CAUSTIC_DEVICE", help="auto, cpu or cuda.")] = "auto"
+    dtype: Annotated[
+        str | None,
+        typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU kernels always use float64."),
+    ] = None
+    threads: Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")] = None
 
     def start_torch(self) -> str:
         """See `start_torch`."""
         return start_torch(self.device, self.threads, self.say)
+
+
+class Computation(Presentation, WithProgress, OnDevice):
+    """Options of the commands that compute for long."""
 
 
 @dataclasses.dataclass(frozen=True)

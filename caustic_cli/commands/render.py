@@ -18,8 +18,8 @@ EXAMPLES = """Examples:
 """
 
 
-class RenderOptions(options.Computation):
-    """Arguments and options of caustic render."""
+class TracingOptions(options.Given):
+    """The lens, and how its light is traced."""
 
     project: Annotated[
         Path,
@@ -56,6 +56,11 @@ class RenderOptions(options.Computation):
             help="Effects to simulate: those that the scene needs, none that can be omitted, or the listed ones (see --explain).",
         ),
     ] = "auto"
+
+
+class OutputOptions(options.Given):
+    """What is written."""
+
     explain: Annotated[
         bool,
         typer.Option("--explain", help="Show which effects are simulated, why, the cost of each, and the error of omitting it."),
@@ -133,6 +138,10 @@ class RenderOptions(options.Computation):
             " squares over the images of the single lenslets); writes wanted.png beside the image.",
         ),
     ] = None
+
+
+class RenderOptions(TracingOptions, OutputOptions, options.Computation):
+    """Arguments and options of caustic render."""
 
 
 def run(asked: RenderOptions) -> None:

@@ -120,7 +120,6 @@ class IntersectionStudy(StudyKind):
     name, home, unit, takes = "intersection", "intersection", "evaluations", ("repeats",)
 
     def run(self, asked: StudyRequest) -> Study:
-        """Run it."""
         rays, lens = (asked.rays, asked.seed or 0), asked.lens
         case = self.module.of_lens(lens.scene, lens.field, lens.heights, *rays) if lens else self.module.table_d3(*rays)
         return self.module.run_intersection(case, repeats=asked.repeats, **asked.seeds)
@@ -135,7 +134,6 @@ class ImageStudy(StudyKind):
         self.name = name
 
     def run(self, asked: StudyRequest) -> Study:
-        """Run it."""
         from caustic_cli.workflow.design import sphere  # noqa: PLC0415
 
         repeats = 3 if asked.repeats is None else asked.repeats
@@ -150,7 +148,6 @@ class EffectStudy(StudyKind):
     name, home, unit, takes, rays_of_all = "effects", "effects", "effects", ("repeats", "dtype"), True
 
     def run(self, asked: StudyRequest) -> Study:
-        """Run it."""
         from caustic_cli.workflow.compilation import compile_for  # noqa: PLC0415
         from caustic_cli.workflow.design import sphere  # noqa: PLC0415
 
@@ -165,7 +162,6 @@ class DesignStudy(StudyKind):
     name, home, unit, takes, of_lenses = "design", "optimiser_comparison", "turns", ("seconds", "dtype"), True
 
     def run(self, asked: StudyRequest) -> Study:
-        """Run it."""
         from caustic_cli.workflow.comparison import timed_designs  # noqa: PLC0415
 
         designs = timed_designs(asked.project, asked.device, asked.dtype, asked.seed)
@@ -178,7 +174,6 @@ class NetworkStudy(DesignStudy):
     name, home = "networks", "architectures"
 
     def run(self, asked: StudyRequest) -> Study:
-        """Run it."""
         from caustic_cli.workflow.architectures import candidates  # noqa: PLC0415
 
         compared = candidates(asked.project, asked.device, asked.dtype, asked.seed, asked.rays)
@@ -192,7 +187,6 @@ class DiffractionStudy(StudyKind):
     name, home, unit, takes = "diffraction", "diffraction", "cases", ("dtype",)
 
     def run(self, asked: StudyRequest) -> Study:
-        """Run it."""
         from caustic_cli.workflow.comparison import lens_of_disc  # noqa: PLC0415
 
         return self.module.run_diffraction(*asked.surface(lens_of_disc), rays=asked.rays, dtype=asked.dtype, **asked.seeds)
@@ -204,7 +198,6 @@ class LightStudy(StudyKind):
     name, home, unit, takes, of_lenses = "light", "efficiency", "lenses", ("seconds",), True
 
     def run(self, asked: StudyRequest) -> Study:
-        """Run it."""
         from caustic_cli.workflow.tradeoff import lenses  # noqa: PLC0415
 
         seconds = self.module.SECONDS if asked.seconds is None else asked.seconds

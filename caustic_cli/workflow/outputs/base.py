@@ -87,18 +87,13 @@ class Request:
     @property
     def shows(self) -> dict[str, object]:
         """Parameters that determine the image, except for its noise, where they differ from their defaults."""
-        found = self.tracing.shows | ({} if self.at is None else {"at": self.at})
-        for output in self.outputs:
-            found |= output.shows
-        return found
+        at = {} if self.at is None else {"at": self.at}
+        return self.tracing.shows | at | {key: value for output in self.outputs for key, value in output.shows.items()}
 
     @property
     def asks(self) -> dict[str, object]:
         """Parameters that determine the result, without the names of outputs."""
-        found = self.tracing.asks | {"at": self.at}
-        for output in self.outputs:
-            found |= output.asks
-        return found
+        return self.tracing.asks | {"at": self.at} | {key: value for output in self.outputs for key, value in output.asks.items()}
 
 
 @dataclass(frozen=True)
@@ -189,9 +184,14 @@ class Rendering:
         self.image, self.figures = self.trace(tolerance=how.tolerance, filter=filter, cut=self.cut)
 
 
+@dataclass(eq=False)
 class Output:
     """One of the things that a render writes or finds out.  Subclasses override what applies to them."""
 
+    #: The option that asks for it; "" for what every render writes.
+    option: ClassVar[str] = ""
+    #: Names of its files, which lie beside the image.
+    files: ClassVar[tuple[str, ...]] = ()
     #: Whether it goes beyond the images, so that its time does not count as the render's.
     beyond: ClassVar[bool] = False
     #: Whether the same output need not be written again while nothing has changed.
@@ -199,8 +199,10 @@ class Output:
 
     @classmethod
     def of(cls, options: Any) -> Self | None:
-        """The output as the options of the command ask for it, None if they do not."""
-        return cls()
+        """The output as the options of the command ask for it, None if they do not; its fields are named as they are."""
+        if cls.option and not getattr(options, cls.option):
+            return None
+        return cls(**{f.name: getattr(options, f.name) for f in fields(cls) if f.init})
 
     @property
     def shows(self) -> dict[str, object]:
@@ -209,12 +211,13 @@ class Output:
 
     @property
     def asks(self) -> dict[str, object]:
-        """Parameters that change the result."""
-        return self.shows
+        """Parameters that change the result, without the names of files."""
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.init}
+        return {self.option: True} | {name: value for name, value in own.items() if not isinstance(value, Path)} | self.shows
 
     def paths(self, place: Place) -> tuple[Path, ...]:
         """The files it may write."""
-        return ()
+        return tuple(map(place.beside, self.files))
 
     def unsupported(self, lens: Lens) -> str | None:
         """Why a lens does not have it, None if it does."""

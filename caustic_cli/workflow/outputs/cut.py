@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar
 
 from caustic_cli.workflow.machining import cut_surface, form_deviation
 from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
@@ -12,31 +12,21 @@ from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
 
 @dataclass(eq=False)
 class MachinedSurface(Output):
-    """The surface that the program `program` leaves; tool_radius: mm, for a program that does not state it."""
+    """The surface that the program `cut` leaves; tool_radius: mm, for a program that does not state it."""
 
-    program: Path
+    option: ClassVar[str] = "cut"
+
+    cut: Path
     tool_radius: float | None = None
     deviation: dict[str, float] = field(default_factory=dict, init=False)
 
-    @classmethod
-    def of(cls, options: Any) -> Self | None:
-        """By the option `cut`."""
-        return None if options.cut is None else cls(options.cut, options.tool_radius)
-
     @property
     def shows(self) -> dict[str, object]:
-        """The program."""
-        return {"cut": fingerprint(self.program)}
-
-    @property
-    def asks(self) -> dict[str, object]:
-        """The program and its tool."""
-        return self.shows | {"tool_radius": self.tool_radius}
+        return {"cut": fingerprint(self.cut)}
 
     def prepare(self, rendering: Rendering) -> None:
-        """Simulate the program, which the render then traces."""
         lens = rendering.lens
-        rendering.cut = cut_surface(self.program, lens.scene, lens.field, self.tool_radius)
+        rendering.cut = cut_surface(self.cut, lens.scene, lens.field, self.tool_radius)
         self.deviation = form_deviation(rendering.cut, lens.field, lens.heights, lens.scene.lens.round)
         rendering.steeper = self.deviation["cut_slope_most"]
 
@@ -46,10 +36,9 @@ class MachinedSurface(Output):
         if rendering.figures["error_by"] == "waves":
             nominal |= rendering.lens.render_waves(effects=rendering.plan, required=False, device=rendering.device).figures
         as_designed = {f"nominal_{name}": nominal[name] for name in ("error", "error_by", "relative_rms", "noise")}
-        return {"cut": {"program": str(self.program)} | as_designed | self.deviation}
+        return {"cut": {"program": str(self.cut)} | as_designed | self.deviation}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
-        """Print the deviation, and the error of the design for comparison."""
         f, nominal = figures["cut"], []
         if f["nominal_error_by"] is not None:
             designed = f"of the surface as designed {f['nominal_error']:.4f} by {f['nominal_error_by']}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from caustic_cli.studies import effects
 from caustic_cli.workflow.compilation import compile_for
@@ -12,17 +12,8 @@ from caustic_cli.workflow.outputs.base import Output, Rendering
 class Explanation(Output):
     """The table of effects."""
 
+    option: ClassVar[str] = "explain"
     beyond: ClassVar[bool] = True
-
-    @classmethod
-    def of(cls, options: Any) -> Self | None:
-        """By the option `explain`."""
-        return cls() if options.explain else None
-
-    @property
-    def asks(self) -> dict[str, object]:
-        """The table."""
-        return {"explain": True}
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """effects: a row for each, see `studies.effects.explain`."""
@@ -40,5 +31,4 @@ class Explanation(Output):
         return {"effects": rows}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
-        """Print the table."""
         say.result(*effects.table(figures["effects"]))

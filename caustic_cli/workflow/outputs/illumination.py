@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,35 +17,26 @@ from caustic_cli.studies.brightness import brightness
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import retrace, white_level
 from caustic_cli.workflow.lens import Lens
-from caustic_cli.workflow.outputs.base import Output, Place, Rendering, fingerprint
+from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
 
 
 @dataclass(eq=False)
 class Illumination(Output):
-    """The brightness of the source of each lenslet that gives the illumination of `picture`."""
+    """The brightness of the source of each lenslet that gives the illumination `want`."""
 
+    option: ClassVar[str] = "want"
+    files: ClassVar[tuple[str, ...]] = ("wanted.png",)
     beyond: ClassVar[bool] = True
 
-    picture: Path
+    want: Path
     #: The target illumination on the pixels of the screen (n_x, n_y), placed like the picture of the project.
     target: np.ndarray = field(default_factory=lambda: np.empty((0, 0)), init=False)
 
-    @classmethod
-    def of(cls, options: Any) -> Self | None:
-        """By the option `want`."""
-        return None if options.want is None else cls(options.want)
-
     @property
     def asks(self) -> dict[str, object]:
-        """The picture."""
-        return {"want": fingerprint(self.picture)}
-
-    def paths(self, place: Place) -> tuple[Path, ...]:
-        """wanted.png."""
-        return (place.beside("wanted.png"),)
+        return {"want": fingerprint(self.want)}
 
     def unsupported(self, lens: Lens) -> str | None:
-        """Of arrays of lenslets with a picture in grey."""
         if lens.project is None or not lens.scene.lens.arrayed:
             return "⟨want⟩ is for a project whose lens is an array of lenslets (caustic design with ⟨+lens.array⟩)"
         if lens.scene.colored:
@@ -53,10 +44,9 @@ class Illumination(Output):
         return None
 
     def prepare(self, rendering: Rendering) -> None:
-        """Read the picture."""
         assert rendering.place.project is not None
         goal = rendering.place.project.settings["target"]
-        light = read_picture(self.picture, goal["encoding"] == "linear")
+        light = read_picture(self.want, goal["encoding"] == "linear")
         self.target = target_on_screen(light.irradiance(), tuple(goal["size"]), rendering.scene.screen, goal["flip"])
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
@@ -85,7 +75,6 @@ class Illumination(Output):
         return {"want": found}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
-        """Print the figures; brightnesses in the layout of the lenslets seen from +z, +y up, +x right."""
         f = figures["want"]
         level = np.array(f["brightness"]).T[::-1]
         lines = [("brightness" if k == 0 else "", "  ".join(f"{b:.4f}" for b in line)) for k, line in enumerate(level)]

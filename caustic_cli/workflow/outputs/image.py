@@ -19,7 +19,6 @@ class RayPicture(Output):
     """The image by rays, as of every render."""
 
     def paths(self, place: Place) -> tuple[Path, ...]:
-        """The image."""
         return (place.image,)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -33,31 +33,26 @@ MISSING = {
 
 @dataclass(eq=False)
 class InteractivePage(Output):
-    """The page at `path`."""
+    """The page at `html`."""
 
-    path: Path
+    option: ClassVar[str] = "html"
+
+    html: Path
 
     def __post_init__(self):
-        destination(self.path)
-
-    @classmethod
-    def of(cls, options: Any) -> Self | None:
-        """By the option `html`."""
-        return None if options.html is None else cls(options.html)
+        destination(self.html)
 
     def paths(self, place: Place) -> tuple[Path, ...]:
-        """The page."""
-        return (self.path,)
+        return (self.html,)
 
     def unsupported(self, lens: Lens) -> str | None:
-        """What the page does not trace."""
         return unsupported(lens.scene)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """Write the page: page, its path."""
         lens = rendering.lens
         write_page(
-            self.path,
+            self.html,
             rendering.plan.scene,
             lens.field,
             lens.heights,
@@ -68,7 +63,7 @@ class InteractivePage(Output):
             waves=rendering.waves,
             encoding=lens.encoding,
         )
-        return {"page": str(self.path)}
+        return {"page": str(self.html)}
 
 
 def _size(values: tuple[float, float], unit: str = " mm") -> str:

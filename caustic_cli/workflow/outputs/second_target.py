@@ -16,7 +16,6 @@ class SecondPicture(Output):
     """The second picture, as of every render of a lens that has one."""
 
     def paths(self, place: Place) -> tuple[Path, ...]:
-        """The image, of a project with a second picture."""
         return () if place.project is None or place.project.second is None else (self._path(place),)
 
     def _path(self, place: Place) -> Path:

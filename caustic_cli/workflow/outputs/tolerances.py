@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from torch import Tensor
@@ -20,41 +20,32 @@ from caustic_cli.studies import tolerances as study
 from caustic_cli.studies.irradiance import source_figures
 from caustic_cli.studies.tolerances_by_waves import WaveTrials
 from caustic_cli.workflow.lens import Lens
-from caustic_cli.workflow.outputs.base import Output, Place, Rendering, not_single
+from caustic_cli.workflow.outputs.base import Output, Rendering, not_single
 
 
 @dataclass(eq=False)
 class ToleranceAnalysis(Output):
-    """Analysis of the errors of the TOML file `path`: figures, and all draws as a table and as a plot beside the image.
+    """Analysis of the errors of the TOML file `tolerances`: figures, and all draws as a table and as a plot beside the image.
 
     A lens that was refined on its wave image is evaluated by that, others by the ray image.
     """
 
+    option: ClassVar[str] = "tolerances"
+    files: ClassVar[tuple[str, ...]] = ("tolerances.csv", "tolerances.png")
     beyond: ClassVar[bool] = True
 
-    path: Path
-
-    @classmethod
-    def of(cls, options: Any) -> Self | None:
-        """By the option `tolerances`."""
-        return None if options.tolerances is None else cls(options.tolerances)
+    tolerances: Path
 
     @cached_property
     def errors(self) -> Tolerances:
         """Distributions of the errors."""
-        return read(self.path)
+        return read(self.tolerances)
 
     @property
     def asks(self) -> dict[str, object]:
-        """The errors."""
         return {"tolerances": self.errors}
 
-    def paths(self, place: Place) -> tuple[Path, ...]:
-        """tolerances.csv and tolerances.png."""
-        return place.beside("tolerances.csv"), place.beside("tolerances.png")
-
     def unsupported(self, lens: Lens) -> str | None:
-        """Of single lenses whose picture is known."""
         if lens.target is None:
             return "⟨tolerances⟩ compares with the picture, which an archive does not hold; render its project"
         return not_single("tolerances", lens)
@@ -86,7 +77,6 @@ class ToleranceAnalysis(Output):
         return {"tolerances": figures | {"csv": str(sheet), "plot": str(plot)}}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
-        """Print the figures."""
         say.table("tolerances", study.rows(figures["tolerances"]))
 
 

@@ -4,31 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
 from caustic_cli.studies import verify
 from caustic_cli.workflow.lens import Lens
-from caustic_cli.workflow.outputs.base import Output, Place, Rendering
+from caustic_cli.workflow.outputs.base import Output, Rendering
 
 
 class MitsubaComparison(Output):
     """The comparison, at the index of a single wavelength."""
 
+    option: ClassVar[str] = "verify"
+    files: ClassVar[tuple[str, ...]] = ("verify.png",)
     beyond: ClassVar[bool] = True
     kept: ClassVar[bool] = False
 
-    @classmethod
-    def of(cls, options: Any) -> Self | None:
-        """By the option `verify`."""
-        return cls() if options.verify else None
-
-    def paths(self, place: Place) -> tuple[Path, ...]:
-        """verify.png."""
-        return (place.beside("verify.png"),)
-
     def unsupported(self, lens: Lens) -> str | None:
-        """Where Mitsuba is not installed, or does not know the scene."""
         return verify.unsupported(lens.scene)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
@@ -44,7 +36,6 @@ class MitsubaComparison(Output):
         return {"verify": found.figures | {"image": str(panels)}}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
-        """Print the comparison."""
         f = figures["verify"]
         noise = f"{f['z_mean_square']:.3f}, {f['z_beyond_3']:.2%}, {f['z_largest']:.2f}  (of noise: 1, 0.27%, 4)"
         rows = [

@@ -18,7 +18,6 @@ class WavePicture(Output):
     """The wave image, as of every render whose plan has diffraction."""
 
     def paths(self, place: Place) -> tuple[Path, ...]:
-        """The image."""
         return (beside(place.image),)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
