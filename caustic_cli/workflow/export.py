@@ -78,9 +78,7 @@ class Exporter:
         given: samples or tolerance, mm; without these the smallest file of at most `most` bytes that keeps the picture, or else the
         best.  For light of a single wavelength, the refractive index in the file is that at this wavelength.
         """
-        scene = self.scene
-        if len(scene.light.wavelengths) == 1:
-            scene = scene.at(scene.light.wavelengths[0])
+        scene = at_own_wavelength(self.scene)
         if why := unsupported(scene, format, script, mould):
             raise InputError(why)
         part = part_of(format, scene, self.field, self.heights, mould, block)
@@ -171,6 +169,11 @@ class Exporter:
         path = Path(f"lens{FORMATS[format][0]}")
         file = File(_home(format), _arguments(format, part), path if format == "heightmap" else None, part)
         return self.error(file, file.choices(MOST_BYTES)[-1], "error") <= self.picture.largest
+
+
+def at_own_wavelength(scene: Scene) -> Scene:
+    """A scene with the refractive index at its wavelength, if it has a single one."""
+    return scene.at(scene.light.wavelengths[0]) if len(scene.light.wavelengths) == 1 else scene
 
 
 def unsupported(scene: Scene, format: str, script: bool, mould: bool) -> str | None:

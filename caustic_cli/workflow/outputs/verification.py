@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
 from caustic_cli.studies import verify
+from caustic_cli.workflow.export import at_own_wavelength
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.outputs.base import Output, Rendering
 
@@ -25,9 +26,7 @@ class MitsubaComparison(Output):
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """verify: the figures of `studies.verify`, and image."""
-        scene, lens, (panels,) = rendering.scene, rendering.lens, self.paths(rendering.place)
-        if len(scene.light.wavelengths) == 1:
-            scene = scene.at(scene.light.wavelengths[0])
+        scene, lens, (panels,) = at_own_wavelength(rendering.scene), rendering.lens, self.paths(rendering.place)
         with TemporaryDirectory() as folder:
             path = Path(folder) / "lens.xml"
             write_mitsuba(path, scene, lens.field, lens.heights, quick_samples(lens.field), dark=True)
