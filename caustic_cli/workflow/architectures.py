@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, InitialHeights, Options
 from caustic_cli.inverse.parametrisation import Architecture
 from caustic_cli.inverse.scene_parameters import Range, Ranges
+from caustic_cli.inverse.schedule import Stage
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import retrace
@@ -94,6 +96,70 @@ class Candidate:
         return {"error": error, "worst": float(errors.max()), "noise": noise}
 
 
+@dataclass(frozen=True, eq=False)
+class NetworkComparison:
+    """What all candidates have in common."""
+
+    scene: Scene
+    target: np.ndarray
+    #: Initial heights, None for the offset surface.
+    first: InitialHeights | None
+    stage: Stage
+    #: Of the project's own design, with the precision and the seed that were asked for; and those that candidates begin from.
+    own: Options
+    base: Options
+    #: Of a retrace.
+    rays: int
+    device: str
+
+    def candidate(
+        self, name: str, options: Options, inputs: str = "", each: list[tuple[Scene, Options]] | None = None
+    ) -> Candidate:
+        """A candidate: one design with these options, or one in each of several scenes with its own."""
+        dense = options.network == "dense"
+        shape = options.architecture
+        about = {
+            "series": f"{name}, {options.preconditioner}, lr {options.lr:g}",
+            "network": options.network,
+            "inputs": inputs,
+            "layers": shape.layers if dense else None,
+            "width": (shape.width or math.prod(self.scene.lens.control)) if dense else None,
+            "activation": shape.activation if dense else None,
+            "preconditioner": options.preconditioner,
+            "lr": options.lr,
+        }
+        goal = torch.from_numpy(self.target)
+        designers = [Designer(one, goal, [self.stage], how, self.device) for one, how in each or [(self.scene, options)]]
+        return Candidate(about, designers, self.first, self.target, self.rays, self.base.seed)
+
+    def grid(self, outputs: Sequence[str], activations: Sequence[str], inputs: str) -> Iterator[Candidate]:
+        """Dense networks of all hyperparameters, with these preconditioners and activations."""
+        for output, lr, act, layers, width in itertools.product(outputs, RATES, activations, LAYERS, WIDTHS):
+            shape = Architecture(layers, width, act)
+            options = replace(self.base, network="dense", initial="zero-last", preconditioner=output, lr=lr, architecture=shape)
+            yield self.candidate(f"{layers} x {width} {act}", options, inputs)
+
+    def free_heights(self) -> Iterator[Candidate]:
+        """Free heights by Adam."""
+        for output, lr in itertools.product(OUTPUTS, FREE_RATES):
+            options = replace(self.base, network="none", initial="zero", preconditioner=output, lr=lr, architecture=Architecture())
+            yield self.candidate("no network", options)
+
+    def of_range(self, over: Ranges) -> Iterator[Candidate]:
+        """The network as designed, the same without inputs, and one network for each value of a range."""
+        yield self.candidate("as designed", self.own, "range")
+        blind = replace(self.own, inputs=False)
+        yield self.candidate("one lens for all", blind, "none")
+        alone = [
+            (
+                over.scene(self.scene, values),
+                replace(blind, over=Ranges(tuple(Range(k, v, v) for k, v in zip(over.keys, values, strict=True)))),
+            )
+            for values in over.evaluation_points()
+        ]
+        yield self.candidate("each value alone", blind, "alone", alone)
+
+
 def candidates(
     project: Project | None, device: str, dtype: torch.dtype | None = None, seed: int | None = None, rays: int | None = None
 ) -> list[Candidate]:
@@ -106,6 +172,17 @@ def candidates(
     Raises:
         InputError: no stage is on rays, or there are two free-form sides.
     """
+    compared = _comparison(project, device, dtype, seed, rays)
+    own = compared.own
+    if own.over is None:
+        return [*compared.grid(OUTPUTS, ACTIVATIONS, ""), *compared.free_heights()]
+    return [*compared.grid((own.preconditioner,), (own.architecture.activation,), "range"), *compared.of_range(own.over)]
+
+
+def _comparison(
+    project: Project | None, device: str, dtype: torch.dtype | None, seed: int | None, rays: int | None
+) -> NetworkComparison:
+    """The scene of a project, or without one that of a bright disc, and the last stage on rays."""
     first: InitialHeights | None = None
     if project is None:
         full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
@@ -122,47 +199,7 @@ def candidates(
             "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
         )
     stage = replace(stages[-1], blur=0.0, iterations=10**9, tolerance=0.0, source=None, spread=False, control=scene.lens.control)
-    own, goal = build_options(full), torch.from_numpy(target)
-    base = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed, optimizer="adam", robust=None)
+    own = build_options(full)
+    own = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed)
     count = rays or RAYS_PER_PIXEL * math.prod(scene.screen.resolution)
-
-    def made(name: str, options: Options, inputs: str = "", each: list[tuple[Scene, Options]] | None = None) -> Candidate:
-        dense = options.network == "dense"
-        shape = options.architecture
-        about = {
-            "series": f"{name}, {options.preconditioner}, lr {options.lr:g}",
-            "network": options.network,
-            "inputs": inputs,
-            "layers": shape.layers if dense else None,
-            "width": (shape.width or math.prod(scene.lens.control)) if dense else None,
-            "activation": shape.activation if dense else None,
-            "preconditioner": options.preconditioner,
-            "lr": options.lr,
-        }
-        designers = [Designer(one, goal, [stage], how, device) for one, how in each or [(scene, options)]]
-        return Candidate(about, designers, first, target, count, base.seed)
-
-    over, found = own.over, []
-    outputs, activations = (OUTPUTS, ACTIVATIONS) if over is None else ((own.preconditioner,), (own.architecture.activation,))
-    for output, lr, act, layers, width in itertools.product(outputs, RATES, activations, LAYERS, WIDTHS):
-        options = replace(
-            base, network="dense", initial="zero-last", preconditioner=output, lr=lr, architecture=Architecture(layers, width, act)
-        )
-        found.append(made(f"{layers} x {width} {act}", options, "" if over is None else "range"))
-    if over is None:
-        for output, lr in itertools.product(OUTPUTS, FREE_RATES):
-            free = replace(base, network="none", initial="zero", preconditioner=output, lr=lr, architecture=Architecture())
-            found.append(made("no network", free))
-        return found
-    found.append(made("as designed", replace(own, dtype=base.dtype, seed=base.seed), "range"))
-    blind = replace(own, dtype=base.dtype, seed=base.seed, inputs=False)
-    found.append(made("one lens for all", blind, "none"))
-    alone = [
-        (
-            over.scene(scene, values),
-            replace(blind, over=Ranges(tuple(Range(k, v, v) for k, v in zip(over.keys, values, strict=True)))),
-        )
-        for values in over.evaluation_points()
-    ]
-    found.append(made("each value alone", blind, "alone", alone))
-    return found
+    return NetworkComparison(scene, target, first, stage, own, replace(own, optimizer="adam", robust=None), count, device)
