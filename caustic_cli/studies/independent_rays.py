@@ -17,7 +17,7 @@ TABLE = 20_001
 def sample_rays(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Origins, mm, and directions (3, N) of independent rays in batches, and their weights (N,), whose mean is 1."""
     source, pupil, lowest = scene.source, scene.pupil, scene.lowest
-    (rx, ry), z_in, round_ = pupil.half_size, pupil.z, pupil.round
+    (rx, ry), z_in, round_ = pupil.half_size, pupil.z, pupil.aperture.round
     if source.profile is not None:
         line = (np.arange(2000) + 0.5) / 1000 - 1
         x, y = np.meshgrid(line, line, indexing="ij")
@@ -42,7 +42,7 @@ def sample_rays(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[t
                 one = _profile(source.profile, x / rx, y / ry) / mean
             yield np.array([x, y, np.full(n, z_in)]) - (1 + (z_in - lowest) / d[2]) * d, d, one
             continue
-        cone = source.cone_over((rx, ry), z_in, round_)
+        cone = source.cone_over(pupil)
         if source.intensity == "lambertian":
             sine = np.sqrt(a) * np.sin(cone)
         elif source.intensity != "uniform":
