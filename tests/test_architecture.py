@@ -2,7 +2,10 @@
 
 import ast
 import math
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -269,6 +272,19 @@ def test_scene_and_bare_errors_need_no_torch():
     modules = [m for m in IMPORTS if part_of(m) in {"scene", "errors"}]
     assert len(modules) > 5
     assert not [m for m in modules if any(i.split(".")[0] in {"torch", "scipy"} for i in IMPORTS[m])]
+
+
+def test_a_trace_in_plain_torch_loads_no_kernel_and_no_capability():
+    """What a scene does not ask for is loaded neither with the tracer nor with its reference backend."""
+    code = """
+import sys
+import caustic_cli.optics.trace, caustic_cli.optics.backends.reference
+rooms = ("kernels", "gradient", "waves", "mesh", "misalignment", "obstruction", "reintersection", "bounds", "plan", "spread")
+found = [m for m in sys.modules if m.startswith(tuple("caustic_cli.optics." + room for room in rooms)) or m == "numba"]
+effects = [m for m in sys.modules if m.startswith("caustic_cli.optics.effects.")]
+sys.exit(0 if not found and effects == ["caustic_cli.optics.effects.base"] else f"{found} {effects}")
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"CAUSTIC_KERNELS": "torch"})
 
 
 def test_no_two_modules_import_each_other():

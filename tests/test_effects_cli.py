@@ -28,7 +28,7 @@ from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.light import RGB
 from caustic_cli.studies import effects as study
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow.render import Request
+from caustic_cli.workflow.outputs.base import Request
 
 NAMES = tuple(effect.name for effect in EFFECTS)
 # A lens of 3 mm: a wave image takes a tenth of the time of one of 10 mm.

@@ -171,14 +171,7 @@ EFFECT = Addition(
             interaction.state.power = (1.0 - COVERED) * interaction.state.power
 '''
     },
-    edits=(
-        (
-            "optics/effects/__init__.py",
-            "from caustic_cli.optics.effects.entrance import Entrance\n",
-            "from caustic_cli.optics.effects.dust import Dust\nfrom caustic_cli.optics.effects.entrance import Entrance\n",
-        ),
-        ("optics/effects/__init__.py", "    SourceSize(),\n", "    SourceSize(),\n    Dust(),\n"),
-    ),
+    edits=(("optics/effects/__init__.py", '        "source-size",\n', '        "source-size",\n        "dust",\n'),),
     used="""
     import torch
     from caustic_cli.optics.emission import rays_of

@@ -233,7 +233,7 @@ def test_colour_survives_the_project(tmp_path):
     """What begin() keeps of a colour picture is read back as the same irradiance."""
     codes = np.random.default_rng(0).integers(0, 256, (5, 4, 3), dtype=np.uint8)
     first = read_picture(save(tmp_path / "a.png", codes))
-    first.write(tmp_path / "target.png")
+    files.write_bytes(tmp_path / "target.png", first.encoded())
     assert np.array_equal(read_picture(tmp_path / "target.png").irradiance(), first.irradiance())
 
 

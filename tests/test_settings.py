@@ -235,7 +235,7 @@ def test_quality_shapes_the_stages(quality, first, last):
 def test_stages_end_sharp_on_the_lens_own_net():
     s = complete({"lens": {"control": [19, 35]}, **OFFSET}, 1.0, Parameters(rays=5000))
     stages = build_stages(s)
-    assert stages[-1].control == (19, 35) and stages[-1].rays == 5000 and stages[-1].blur == 0.0
+    assert stages[-1].control == (19, 35) and stages[-1].rays == 5000 and stages[-1].rendering.blur == 0.0
     blurs = [stage.rendering.blur for stage in stages]
     assert blurs == sorted(blurs, reverse=True) and blurs[0] > 0
 

@@ -32,6 +32,7 @@ from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.several import Several
 from caustic_cli.scene.tolerances import KINDS, FormError, Waviness, hypercube
 from caustic_cli.studies import tolerances as study
+from caustic_cli.studies.tolerances_by_waves import WaveTrials
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "tolerances.toml"
 ALL = Misalignment(0.003, 0.04, 2.0, (0.3, -0.2), 1.5, 0.1, (0.4, -0.3), (0.2, -0.1), (0.7, -0.5), (0.5, 0.3), (3.0, -2.0))
@@ -254,7 +255,7 @@ def test_a_wave_image_brightens_as_its_rays_do():
     def image(s: Scene, *_) -> np.ndarray:  # of rays: smooth, and quick
         return np.mean(study.Trials(s, field, heights, np.ones((32, 32)), errors).images({}), 0)[0]
 
-    t = study.Trials(scene, field, heights, image(scene), errors, waves=image)
+    t = WaveTrials(scene, field, heights, image(scene), errors, waves=image)
     quick, own = t.by_waves({("source_shift", 0): 0.5}, None)
     assert t.evaluate({}).relative_rms < 0.02 and own.relative_rms > 0.15
     assert quick.relative_rms == pytest.approx(own.relative_rms, rel=0.1)

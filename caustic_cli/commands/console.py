@@ -234,13 +234,6 @@ def ended_words(reason: str) -> str:
     return "; ".join([ENDED.get(first, first), *more])
 
 
-def _wavelengths(values: list[float]) -> str:
-    """Wavelengths as a clause."""
-    if len(values) == 1:
-        return f"at {values[0]:.4g} nm"
-    return f"at {len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
-
-
 def figures_rows(figures: dict) -> list[tuple[str, str]]:
     """The figures of merit as rows for display: the judged figure, then those of the same image; those of the other image, by rays
     or by waves, in one row that says so, which stands last where waves judge."""

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError
+from caustic_cli.workflow.convergence import NETWORKS, STUDIES, StudyKind, StudyRequest
+
+if TYPE_CHECKING:
+    from caustic_cli.studies.report import Study
 
 EXAMPLES = """Examples:
 
@@ -18,14 +23,10 @@ EXAMPLES = """Examples:
   caustic convergence flame.caustic --study design --seconds 20
 """
 
-STUDIES = ("intersection", "rays", "reconstruction", "precision", "effects", "design", "diffraction", "light")
-#: Studies that use --rays for their largest setting also in --study all.
-BY_RAYS = ("rays", "reconstruction", "precision", "effects")
-#: Studies whose errors are those of lenses against the picture, as of a design; others compare images with each other.
-OF_LENSES = ("design", "networks", "light")
 
+class ConvergenceOptions(options.Computation):
+    """Arguments and options of caustic convergence."""
 
-def run(
     project: Annotated[
         Path | None,
         typer.Argument(
@@ -36,7 +37,7 @@ def run(
             " the lens).",
             show_default=False,
         ),
-    ] = None,
+    ] = None
     study: Annotated[
         str,
         typer.Option(
@@ -47,7 +48,7 @@ def run(
             " size, wavelength and source size; light: image error against efficiency, over"
             " thickness and the loss' weight of light; all: one after the other."
         ),
-    ] = "intersection",
+    ] = "intersection"
     networks: Annotated[
         bool,
         typer.Option(
@@ -55,7 +56,7 @@ def run(
             help="Study design: a grid of networks over layers, width, activation, learning rate and preconditioner, all trained"
             " equally; for a project designed --over a range also one lens for the whole range and a network for each value.",
         ),
-    ] = False,
+    ] = False
     rays: Annotated[
         str | None,
         typer.Option(
@@ -64,91 +65,87 @@ def run(
             " many.  Study intersection: rays intersected; study design: rays of a retrace."
             "  [default: by study, about half a minute in all]",
         ),
-    ] = None,
+    ] = None
     repeats: Annotated[
         int | None,
         typer.Option(
             help="Rounds, each with fresh rays (intersection: the same); the times' median and"
             " range are reported.  [default: 3; intersection: 9]"
         ),
-    ] = None,
+    ] = None
     seconds: Annotated[
         float | None,
         typer.Option(
             help="Study design: time per method, with --networks on average.  [default: 4]  Study light: per lens.  [default: 10]"
         ),
-    ] = None,
+    ] = None
     output: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Directory for CSV, JSON and PNG.")] = Path(
         "convergence"
-    ),
-    force: options.Force = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    progress: options.Progress = "auto",
-    seed: options.Seed = None,
-    device: options.Device = "auto",
-    dtype: options.Dtype = None,
-    threads: options.Threads = None,
-    debug: options.Debug = False,
-) -> None:
+    )
+
+
+def run(asked: ConvergenceOptions) -> None:
     """Measure errors and computing times for many settings."""
-    began, say = time.monotonic(), console.Reporter(quiet, progress, json)
-    if study not in (*STUDIES, "all"):
-        raise InputError(f"--study must be one of {', '.join(STUDIES)} or all, got {study!r}")
-    if networks and study != "design":
-        raise InputError(f"--networks belongs to --study design, got {study}")
-    names = STUDIES if study == "all" else ("networks",) if networks else (study,)
-    count = options.rays("--rays", rays) if rays else None
-    for option, given in (("--seconds", seconds), ("--repeats", repeats), ("--dtype", dtype)):
-        if given is not None and not any(_takes(name, option) for name in names):
-            raise InputError(f"{option} has no meaning for --study {study}: leave it out")
-    precision = options.dtype_of(dtype) if dtype else None
-    if (output.exists() or output.is_symlink()) and not output.is_dir():
-        raise InputError(f"{output}: is no directory; a directory for CSV, JSON and PNG is needed")
-    if project is not None:
-        options.require_project(project)
-    device = options.start_torch(device, threads, say)
+    began, say = time.monotonic(), asked.say
+    kinds, rays = _kinds(asked), options.rays("--rays", asked.rays) if asked.rays else None
+    given, output = _given(asked, kinds), asked.output
+    device = asked.start_torch()
 
     from caustic_cli.studies import report  # noqa: PLC0415
-    from caustic_cli.workflow.convergence import PLOTS, UNITS, Request, measure  # noqa: PLC0415
     from caustic_cli.workflow.lens import load  # noqa: PLC0415
 
     if output.is_dir():
-        for name in names:
-            report.refuse_foreign_files(report.paths_of(name, output, PLOTS.get(name)), force)
-    lens, done = None if project is None else load(project), []
-    for name in names:
-        asked = Request(
-            count if study != "all" or name in BY_RAYS else None,
-            repeats if _takes(name, "--repeats") else None,
-            seconds if _takes(name, "--seconds") else None,
-            seed,
-            precision if _takes(name, "--dtype") else None,
-        )
-        start = time.monotonic()
+        for kind in kinds:
+            report.refuse_foreign_files(report.paths_of(kind.name, output, kind.plots), asked.force)
+    lens, done = None if asked.project is None else load(asked.project), []
+    for kind in kinds:
+        start, own = time.monotonic(), {option: value for option, value in given.items() if option in kind.takes}
+        own["rays"] = rays if kind.rays_of_all or len(kinds) == 1 else None
         with say.progress(None) as show:
-
-            def tell(part: int, whole: int, name: str = name, show=show) -> None:
-                show(name, UNITS.get(name, "rays"), part, whole)
-
-            found = measure(name, lens, asked, device, say, tell)
+            tell = partial(show, kind.name, kind.unit)
+            found = kind.measure(StudyRequest(lens, device, say, tell, seed=asked.seed, **own))
         paths = report.write(found, output)
-        _show(found, paths, say)
-        done.append(_as_json(found, paths) | {"seconds": time.monotonic() - start})
-    if json:
-        console.emit_json(done[0] if study != "all" else {"study": "all", "studies": done, "seconds": time.monotonic() - began})
+        _show(kind, found, paths, say)
+        done.append(_as_json(kind, found, paths) | {"seconds": time.monotonic() - start})
+    if asked.json:
+        whole = {"study": "all", "studies": done, "seconds": time.monotonic() - began}
+        console.emit_json(done[0] if len(kinds) == 1 else whole)
 
 
-def _takes(study: str, option: str) -> bool:
-    """Whether an option applies to a study."""
-    if option == "--seconds":
-        return study in ("design", "networks", "light")
-    if option == "--repeats":
-        return study not in ("design", "networks", "diffraction", "light")
-    return study not in ("intersection", "light")
+def _given(asked: ConvergenceOptions, kinds: list[StudyKind]) -> dict[str, Any]:
+    """The options that apply to some studies only.
+
+    Raises:
+        InputError: one applies to none of these, there is no such precision, or something stands in the place of the directory.
+    """
+    given: dict[str, Any] = {"seconds": asked.seconds, "repeats": asked.repeats, "dtype": asked.dtype}
+    for option, value in given.items():
+        if value is not None and not any(option in kind.takes for kind in kinds):
+            raise InputError(f"--{option} has no meaning for --study {asked.study}: leave it out")
+    given["dtype"] = options.dtype_of(asked.dtype) if asked.dtype else None
+    if (asked.output.exists() or asked.output.is_symlink()) and not asked.output.is_dir():
+        raise InputError(f"{asked.output}: is no directory; a directory for CSV, JSON and PNG is needed")
+    if asked.project is not None:
+        options.require_project(asked.project)
+    return given
 
 
-def _show(found, paths: list[Path], say: console.Reporter) -> None:
+def _kinds(asked: ConvergenceOptions) -> list[StudyKind]:
+    """The studies to run.
+
+    Raises:
+        InputError: there is none of this name, or it has no networks.
+    """
+    if asked.study not in (*STUDIES, "all"):
+        raise InputError(f"--study must be one of {', '.join(STUDIES)} or all, got {asked.study!r}")
+    if asked.networks and asked.study != "design":
+        raise InputError(f"--networks belongs to --study design, got {asked.study}")
+    if asked.networks:
+        return [NETWORKS]
+    return list(STUDIES.values()) if asked.study == "all" else [STUDIES[asked.study]]
+
+
+def _show(kind: StudyKind, found: Study, paths: list[Path], say: console.Reporter) -> None:
     rows = [
         (
             name,
@@ -160,7 +157,7 @@ def _show(found, paths: list[Path], say: console.Reporter) -> None:
     ]
     if "source" in found.about:
         rows.insert(0, ("rays", f"{found.about['rays']:,} from {found.about['source']}"))
-    if found.name in OF_LENSES:
+    if kind.of_lenses:
         rows.insert(0, ("errors", "against the picture, by rays"))
     say.table(
         f"{found.name}: fitted orders" if found.orders else found.name,
@@ -168,10 +165,10 @@ def _show(found, paths: list[Path], say: console.Reporter) -> None:
     )
 
 
-def _as_json(found, paths: list[Path]) -> dict:
+def _as_json(kind: StudyKind, found: Study, paths: list[Path]) -> dict:
     return {
         "study": found.name,
-        **({"error_by": "rays"} if found.name in OF_LENSES else {}),
+        **({"error_by": "rays"} if kind.of_lenses else {}),
         "advice": found.advice,
         "rows": found.rows,
         "files": [str(p) for p in paths],

@@ -21,8 +21,13 @@ EXAMPLES = """Examples:
 """
 
 
-@options.from_table("design")
-def run(
+#: Settings that can be given to a design that is resumed.
+CONTINUED = ("design.iterations", "design.time_limit")
+
+
+class DesignOptions(options.Computation):
+    """Arguments and options of caustic design."""
+
     target: Annotated[
         Path,
         typer.Argument(
@@ -30,23 +35,23 @@ def run(
             help="The picture: an image file or a 2-D .npy of irradiance, - for standard input; with --resume, the project.",
             show_default=False,
         ),
-    ],
-    given: dict[str, Any],
+    ]
+    given: Annotated[dict[str, Any], options.TableOptions("design")]
     preset: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
             help="Settings of a common product, such as plate-100 (list: all of them); --config and options take precedence.",
         ),
-    ] = None,
+    ] = None
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="TOML with any keys of project.toml; options take precedence.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Resume the project TARGET from its last checkpoint.")] = False,
+    ] = None
+    resume: Annotated[bool, typer.Option("--resume", help="Resume the project TARGET from its last checkpoint.")] = False
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Project directory.  [default: TARGET's stem + .caustic, here]"),
-    ] = None,
+    ] = None
     movie: Annotated[
         Path | None,
         typer.Option(
@@ -54,83 +59,95 @@ def run(
             help="Also record the design: the image during the iterations, as the optimiser sees it, then that of the final lens;"
             " .gif, or .mp4 where ffmpeg is installed.",
         ),
-    ] = None,
-    force: options.Force = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    progress: options.Progress = "auto",
-    seed: options.Seed = None,
-    device: options.Device = "auto",
-    dtype: options.Dtype = None,
-    threads: options.Threads = None,
-    debug: options.Debug = False,
-) -> None:
+    ] = None
+
+
+def run(asked: DesignOptions) -> None:
     """Compute the lens whose caustic is the picture TARGET."""
     speaks = checks.rank_and_size()[0] == 0  # under torchrun, rank 0
-    say = console.Reporter(quiet or not speaks, progress, json)
-    iterations, time_limit = given.get("design.iterations"), given.get("design.time_limit")
-    if iterations is not None and not 1 <= iterations <= 10**9:
-        raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
-    if time_limit is not None and not time_limit > 0:
-        raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
-    if resume and (names := _beside_resume(given, preset, config)):
-        raise InputError(
-            f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
-            " --iterations and --time-limit can, and project.toml can be edited"
-        )
-    piped = not resume and str(target) == "-"
-    path = out or Path(f"{'picture' if piped else target.stem or 'design'}.caustic")
-    picture: Any = target
-    if movie is not None and speaks:
-        from caustic_cli.io.movie import refuse_unwritable  # noqa: PLC0415
-
-        refuse_unwritable(movie, force)
-    if not resume and speaks:
-        from caustic_cli.config.presets import path_of  # noqa: PLC0415
-        from caustic_cli.config.settings import by_section, implied, refuse_unused  # noqa: PLC0415
-        from caustic_cli.config.values import refuse_bad_file, refuse_bad_options  # noqa: PLC0415
-        from caustic_cli.io.files import read_stdin  # noqa: PLC0415
-        from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, read_picture  # noqa: PLC0415
-
-        if (target / "project.toml").is_file():
-            raise InputError(f"{target}: is a project, not a picture; caustic design --resume {target} goes on with it")
-        # checked before torch is loaded and kernels are compiled
-        if preset is not None:
-            path_of(preset)
-        if config is not None:
-            refuse_bad_file(config, parameters=True)
-        refuse_bad_options(given)
-        if config is None and preset is None:
-            refuse_unused({"type": default("source.type")} | implied(by_section(given)).get("source", {}), given)
-        picture = read_stdin(ACCEPTED, MAX_BYTES) if piped else target
-        if config is None:  # a configuration may set its encoding
-            read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
-    project = target if target.is_dir() else path
-    if resume and speaks:
-        if not target.exists() and not project.exists():
-            raise InputError(f"{target}: no such project; --resume needs a directory made by caustic design")
-        options.require_project(project)
-    device = options.start_torch(device, threads, say)
+    asked.quiet = asked.quiet or not speaks
+    say, target = asked.say, asked.target
+    _check(asked)
+    piped = not asked.resume and str(target) == "-"
+    path = asked.out or Path(f"{'picture' if piped else target.stem or 'design'}.caustic")
+    project, picture = target if target.is_dir() else path, target
+    if speaks:
+        picture = _check_before_torch(asked, project)
+    device = asked.start_torch()
 
     from caustic_cli.inverse import ranks  # noqa: PLC0415
     from caustic_cli.workflow import library  # noqa: PLC0415
     from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
-    with _saying_what_is_kept(path if not resume else project), ranks.process_group(device) as rank:
+    with _saying_what_is_kept(project if asked.resume else path), ranks.process_group(device) as rank:
         if rank > 0:
             follow(device)
             return
-        if resume:
-            lens = library.resume(
-                project, iterations=iterations, time_limit=time_limit, movie=movie, force=force, say=say, device=device
-            )
+        how: dict[str, Any] = {"force": asked.force, "movie": asked.movie, "say": say, "device": device}
+        if asked.resume:
+            iterations, time_limit = (asked.given.get(setting) for setting in CONTINUED)
+            lens = library.resume(project, iterations=iterations, time_limit=time_limit, **how)
         else:
-            lens = library.design_of(
-                picture, given, preset=preset, config=config, out=path, force=force, movie=movie, say=say, device=device
-            )
+            lens = library.design_of(picture, asked.given, preset=asked.preset, config=asked.config, out=path, **how)
     say.table(lens.figures["project"], console.figures_rows(lens.figures))
-    if json:
+    if asked.json:
         console.emit_json(lens.figures)
+
+
+def _check(asked: DesignOptions) -> None:
+    """Refuse numbers out of range, and options beside --resume."""
+    iterations, time_limit = (asked.given.get(setting) for setting in CONTINUED)
+    if iterations is not None and not 1 <= iterations <= 10**9:
+        raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
+    if time_limit is not None and not time_limit > 0:
+        raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
+    if asked.resume and (names := _beside_resume(asked)):
+        raise InputError(
+            f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
+            " --iterations and --time-limit can, and project.toml can be edited"
+        )
+
+
+def _check_before_torch(asked: DesignOptions, project: Path) -> Any:
+    """Refuse input before torch is loaded and kernels are compiled; the picture, as far as it had to be read.
+
+    Raises:
+        InputError: the movie cannot be written, there is no project or picture, or a setting is out of range.
+    """
+    if asked.movie is not None:
+        from caustic_cli.io.movie import refuse_unwritable  # noqa: PLC0415
+
+        refuse_unwritable(asked.movie, asked.force)
+    if not asked.resume:
+        return _check_new(asked)
+    if not asked.target.exists() and not project.exists():
+        raise InputError(f"{asked.target}: no such project; --resume needs a directory made by caustic design")
+    options.require_project(project)
+    return asked.target
+
+
+def _check_new(asked: DesignOptions) -> Any:
+    """Refuse settings and picture of a new design; the picture: a path, or what was read from standard input."""
+    from caustic_cli.config.presets import path_of  # noqa: PLC0415
+    from caustic_cli.config.settings import by_section, implied, refuse_unused  # noqa: PLC0415
+    from caustic_cli.config.values import refuse_bad_file, refuse_bad_options  # noqa: PLC0415
+    from caustic_cli.io.files import read_stdin  # noqa: PLC0415
+    from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, read_picture  # noqa: PLC0415
+
+    given, target = asked.given, asked.target
+    if (target / "project.toml").is_file():
+        raise InputError(f"{target}: is a project, not a picture; caustic design --resume {target} goes on with it")
+    if asked.preset is not None:
+        path_of(asked.preset)
+    if asked.config is not None:
+        refuse_bad_file(asked.config, parameters=True)
+    refuse_bad_options(given)
+    if asked.config is None and asked.preset is None:
+        refuse_unused({"type": default("source.type")} | implied(by_section(given)).get("source", {}), given)
+    picture = read_stdin(ACCEPTED, MAX_BYTES) if str(target) == "-" else target
+    if asked.config is None:  # a configuration may set its encoding
+        read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
+    return picture
 
 
 @contextmanager
@@ -150,8 +167,8 @@ def _saying_what_is_kept(project: Path):
         raise
 
 
-def _beside_resume(given: dict[str, Any], preset: str | None, config: Path | None) -> list[str]:
+def _beside_resume(asked: DesignOptions) -> list[str]:
     """Names of the given options that cannot be combined with --resume."""
-    others = [TABLE[path].option for path in given if path not in ("design.iterations", "design.time_limit")]
-    files = [name for name, value in (("--preset", preset), ("--config", config)) if value is not None]
+    others = [TABLE[path].option for path in asked.given if path not in CONTINUED]
+    files = [f"--{name}" for name in ("preset", "config") if getattr(asked, name) is not None]
     return [*(option.name for option in others if option), *files]

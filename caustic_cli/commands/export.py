@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,11 +21,24 @@ EXAMPLES = """Examples:
 """
 
 
-@options.from_fields(Milling, "milling")
-def run(
+#: Formats to which an option applies; those of milling apply to gcode.
+TAKERS: dict[str, Sequence[str]] = {
+    "mould": MOULDS,
+    "block": MOULDS,
+    "samples": [name for name in FORMATS if name not in UNSAMPLED],
+    "tolerance": WITHIN,
+    "max_size": [name for name in FORMATS if name != "gcode"],
+    "script": ("lighttools",),
+    "milling": ("gcode",),
+}
+
+
+class ExportOptions(options.OfDesign, options.Debugging):
+    """Arguments and options of caustic export."""
+
     project: Annotated[
         Path | None, typer.Argument(metavar="PROJECT", help="Project directory made by caustic design.", show_default=False)
-    ] = None,
+    ] = None
     format: Annotated[
         str | None,
         typer.Option(
@@ -33,11 +47,11 @@ def run(
             help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items())
             + ".  [default: what --out's suffix says; lighttools]",
         ),
-    ] = None,
+    ] = None
     output: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="FILE", help="File to write.  [default: PROJECT's name + the format's suffix, here]"),
-    ] = None,
+    ] = None
     samples: Annotated[
         str | None,
         typer.Option(
@@ -45,7 +59,7 @@ def run(
             help="Points along x and y.  [default: as few as keep the picture: its relative RMS error as read from the file is at"
             " most 1.05 times that of the lens]",
         ),
-    ] = None,
+    ] = None
     tolerance: Annotated[
         float | None,
         typer.Option(
@@ -54,7 +68,7 @@ def run(
             " of bilinear interpolation; gcode: of linear moves (a hundredth of the scallops); step: of a spline with as few"
             " knots as possible, 0 for the exact one; lighttools: 0 for exact numbers.  [default: as --samples]",
         ),
-    ] = None,
+    ] = None
     max_size: Annotated[
         str | None,
         typer.Option(
@@ -63,77 +77,48 @@ def run(
             help="Largest file, like 20MB.  Where the picture does not fit, the best below is written, with a warning.  "
             "[default: 100MB]",
         ),
-    ] = None,
+    ] = None
     mould: Annotated[
         bool,
         typer.Option(
             "--mould", help="step, stl, ply, obj, heightmap, gcode: the negative form, oriented for machining from above."
         ),
-    ] = False,
+    ] = False
     block: Annotated[
         float | None,
         typer.Option(
             metavar="MM", help="Mirror or mould: least material behind the surface.  [default: a fifth of the larger side]"
         ),
-    ] = None,
-    *,
-    milling: dict[str, Any],
+    ] = None
+    milling: Annotated[dict[str, Any], options.FieldOptions(Milling)]
     script: Annotated[
         bool,
         typer.Option(
             "--script",
             help="lighttools: also write a Python script for its COM interface and an .lts point block that rebuild the scene.",
         ),
-    ] = False,
-    at: options.At = None,
-    force: options.Force = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    debug: options.Debug = False,
-) -> None:
+    ] = False
+
+
+def run(asked: ExportOptions) -> None:
     """Write the lens of PROJECT in the formats of other programs."""
-    say = console.Reporter(quiet, as_json=json)
+    say, project = asked.say, asked.project
     if project is None:
         listed = ", ".join(f"{name} ({suffix})" for name, (suffix, _, _) in FORMATS.items())
         raise InputError(f"a project is needed, and a --format or an --out with its suffix, of {listed}")
-    formats = [format_of(output)] if format is None and output else [name.strip() for name in (format or "lighttools").split(",")]
-    if output and len(formats) > 1:
-        raise InputError("--out names one file; several formats are written beside each other under the project's own name")
-    for name in formats:
-        format_of(output, name)
-    options_of = {
-        "--mould": (mould, MOULDS),
-        "--block": (block is not None, MOULDS),
-        "--samples": (samples, [name for name in FORMATS if name not in UNSAMPLED]),
-        "--tolerance": (tolerance is not None, WITHIN),
-        "--max-size": (max_size is not None, [name for name in FORMATS if name != "gcode"]),
-        "--script": (script, ("lighttools",)),
-        **{f"--{name.replace('_', '-')}": (True, ("gcode",)) for name in milling},
-    }
-    for option, (given, takers) in options_of.items():
-        if given and not set(takers) & set(formats):
-            what = " (a spline, or a path along it, has no samples)" if option == "--samples" else ""
-            raise InputError(f"{option} belongs to --format {alternatives(takers)}, got {', '.join(formats)}{what}")
-    if block is not None and not 0 < block < 1e6:
-        raise InputError(f"--block must be greater than 0 mm, got {block:g}")
-    _check_milling(milling)
-    if max_size is not None and (samples is not None or tolerance is not None):
-        raise InputError("--max-size chooses the points itself: give it without --samples and --tolerance")
-    most = MOST_BYTES if max_size is None else options.size_in_bytes("--max-size", max_size)
-    count = tuple(options.both(options.counts("--samples", samples))) if samples else None
-    given_of = {"mould": mould or None, "block": block, "samples": count, "tolerance": tolerance, "milling": milling or None}
-
+    formats = _formats(asked)
+    given = _given(asked, formats)
+    most = MOST_BYTES if asked.max_size is None else options.size_in_bytes("--max-size", asked.max_size)
     options.require_project(project, archives=True)  # before torch is loaded
 
     from caustic_cli.workflow.export import accuracy_words, export, exporter_of  # noqa: PLC0415
 
-    exporter, opened = exporter_of(project, at, say, most)
+    exporter, opened = exporter_of(project, asked.at, say, most)
     all_figures = []
     for name in formats:
-        given = {
-            key: v for key, v in given_of.items() if v is not None and name in options_of.get(f"--{key}", (True, ("gcode",)))[1]
-        }
-        figures = export(exporter, opened, name, output, script and name == "lighttools", given, force, at)
+        own = {option: value for option, value in given.items() if name in TAKERS[option]}
+        script = asked.script and name in TAKERS["script"]
+        figures = export(exporter, opened, name, asked.output, script, own, asked.force, asked.at)
         all_figures.append(figures)
         words = accuracy_words(figures)
         say.result(f"{figures['file']}: {figures['bytes']:,} bytes{f', {words}' if words else ''}")
@@ -143,8 +128,58 @@ def run(
             from caustic_cli.studies.scallops import rows  # noqa: PLC0415
 
             say.table("milling", rows(figures["milling"]))
-    if json:
+    if asked.json:
         console.emit_json(all_figures[0] if len(formats) == 1 else {"exports": all_figures})
+
+
+def _formats(asked: ExportOptions) -> list[str]:
+    """Names of the formats.
+
+    Raises:
+        InputError: one is unknown, or the output does not fit it.
+    """
+    if asked.format is None and asked.output:
+        formats = [format_of(asked.output)]
+    else:
+        formats = [name.strip() for name in (asked.format or "lighttools").split(",")]
+    if asked.output and len(formats) > 1:
+        raise InputError("--out names one file; several formats are written beside each other under the project's own name")
+    for name in formats:
+        format_of(asked.output, name)
+    return formats
+
+
+def _given(asked: ExportOptions, formats: list[str]) -> dict[str, Any]:
+    """The options of formats that were given, by name, as `workflow.export.export` takes them.
+
+    Raises:
+        InputError: one applies to none of the formats, is out of range, or contradicts another.
+    """
+    _check_takers(asked, formats)
+    if asked.block is not None and not 0 < asked.block < 1e6:
+        raise InputError(f"--block must be greater than 0 mm, got {asked.block:g}")
+    _check_milling(asked.milling)
+    if asked.max_size is not None and (asked.samples is not None or asked.tolerance is not None):
+        raise InputError("--max-size chooses the points itself: give it without --samples and --tolerance")
+    given = {
+        "mould": asked.mould or None,
+        "block": asked.block,
+        "samples": tuple(options.both(options.counts("--samples", asked.samples))) if asked.samples else None,
+        "tolerance": asked.tolerance,
+        "milling": asked.milling or None,
+    }
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _check_takers(asked: ExportOptions, formats: list[str]) -> None:
+    """Check that every option given applies to one of the formats."""
+    said = {name: getattr(asked, name) for name in TAKERS if name != "milling"}
+    for name, value in (said | asked.milling).items():
+        takers = TAKERS.get(name, TAKERS["milling"])
+        if value is not None and value is not False and not set(takers) & set(formats):
+            what = " (a spline, or a path along it, has no samples)" if name == "samples" else ""
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{option} belongs to --format {alternatives(takers)}, got {', '.join(formats)}{what}")
 
 
 def _check_milling(given: dict[str, Any]) -> None:

@@ -9,9 +9,11 @@ import inspect
 import math
 import os
 import re
+from collections.abc import Callable
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
@@ -28,10 +30,6 @@ LISTS = {
 }
 #: Parameters of mallopt(3), from glibc's malloc.h.
 TRIM_THRESHOLD, MMAP_MAX = -1, -4
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout instead of the table.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Print nothing on stderr except errors.")]
-Debug = Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
 At = Annotated[
     str | None,
     typer.Option(
@@ -39,85 +37,158 @@ At = Annotated[
         help="For a network trained --over a range: the lens for this value, like throw=300 (mm).  [default: the middle]",
     ),
 ]
-Seed = Annotated[
-    int | None,
-    typer.Option(envvar="CAUSTIC_SEED", help="Seed of all random numbers; the same seed gives the same bytes.  [default: 0]"),
-]
-Device = Annotated[str, typer.Option(envvar="CAUSTIC_DEVICE", help="auto, cpu or cuda.")]
-Dtype = Annotated[
-    str | None,
-    typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU kernels always use float64."),
-]
-Threads = Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")]
-Progress = Annotated[
-    str,
-    typer.Option(
-        envvar="CAUSTIC_PROGRESS",
-        metavar="auto|json",
-        help="json: print JSON on stderr, one object per line, including the progress; errors stay plain text.",
-    ),
-]
-Project = Annotated[Path, typer.Argument(help="Project directory made by caustic design.", show_default=False)]
 
 
-def from_table(command: str):
-    """Decorator that replaces the parameter `given` of a command by the options that the table of settings defines for it.
+class Given:
+    """Arguments and options of a command, as given.
 
-    The command receives `given`: path -> value of the settings given by options; messages then refer to these settings by
-    option (`console.speak`).
-    """
-    rows = {row.option.name.lstrip("-").replace("-", "_"): row for row in table.options_of(command)}
-
-    def decorate(body):
-        own = inspect.signature(body, eval_str=True).parameters
-
-        def run(**values):
-            said = {name: value for name in rows if not ((value := values.pop(name)) is None or value is False or value == [])}
-            spoken = {path: rows[name].option.name for name in said for path in (rows[name].path, *rows[name].speaks_for)}
-            common = {name: row for name, row in COMMON.items() if values.get(name) is not None}
-            console.set_option_names(spoken | {row.path: row.option.name for row in common.values()})
-            given: dict[str, Any] = {row.path: values[name] for name, row in common.items()}
-            for name, value in said.items():
-                given |= _read(rows[name], value)
-            return body(given=given, **values)
-
-        parameters = []
-        for name, parameter in own.items():
-            parameters += (
-                map(_parameter, rows, rows.values())
-                if name == "given"
-                else [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
-            )
-        run.__signature__ = inspect.Signature(parameters)
-        run.__annotations__ = {p.name: p.annotation for p in parameters}
-        run.__doc__, run.__name__ = body.__doc__, body.__name__
-        return run
-
-    return decorate
-
-
-def from_fields(kind: type, parameter: str):
-    """Decorator that replaces a parameter of a command by an option for each field of a dataclass.
-
-    The command receives a dictionary of the options given.  Fields have help and unit in their metadata.
+    A subclass declares them as annotated attributes with their defaults, in the order of the help; the options of a base class
+    follow its own.  `command_of` makes the command's signature of them.  An attribute annotated with a group of options
+    (`TableOptions`, `FieldOptions`) holds what the group makes of those that were given.
     """
 
-    def decorate(body):
-        own, rows = inspect.signature(body, eval_str=True).parameters, {row.name: row for row in dataclasses.fields(kind)}
+    json: bool
+    quiet: bool
+    progress: str = "auto"
 
-        def run(**values):
-            said = {name: value for name in rows if (value := values.pop(name)) is not None}
-            return body(**{parameter: said}, **values)
+    def __init__(self, **values: Any):
+        vars(self).update(values)
 
-        parameters = []
-        for name, one in own.items():
-            parameters += map(_of_field, rows.values()) if name == parameter else [one.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
-        run.__signature__ = inspect.Signature(parameters)
-        run.__annotations__ = {p.name: p.annotation for p in parameters}
-        run.__doc__, run.__name__ = body.__doc__, body.__name__
-        return run
+    @cached_property
+    def say(self) -> Reporter:
+        """Where results and messages go."""
+        return Reporter(self.quiet, self.progress, self.json)
 
-    return decorate
+
+class Presentation(Given):
+    """Options of all commands: what they print and write."""
+
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False
+    json: Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout instead of the table.")] = False
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Print nothing on stderr except errors.")] = (
+        False
+    )
+
+
+class OfDesign(Presentation):
+    """Options of the commands that take the lens of a project as it is."""
+
+    at: At = None
+
+
+class WithProgress(Given):
+    """The option of the commands that show their progress."""
+
+    progress: Annotated[
+        str,
+        typer.Option(
+            envvar="CAUSTIC_PROGRESS",
+            metavar="auto|json",
+            help="json: print JSON on stderr, one object per line, including the progress; errors stay plain text.",
+        ),
+    ] = "auto"
+
+
+class Debugging(Given):
+    """The last option of all commands."""
+
+    debug: Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")] = False
+
+
+class OnDevice(Debugging):
+    """Options of the commands that trace rays."""
+
+    seed: Annotated[
+        int | None,
+        typer.Option(envvar="CAUSTIC_SEED", help="Seed of all random numbers; the same seed gives the same bytes.  [default: 0]"),
+    ] = None
+    device: Annotated[str, typer.Option(envvar="CAUSTIC_DEVICE", help="auto, cpu or cuda.")] = "auto"
+    dtype: Annotated[
+        str | None,
+        typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU kernels always use float64."),
+    ] = None
+    threads: Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")] = None
+
+    def start_torch(self) -> str:
+        """See `start_torch`."""
+        return start_torch(self.device, self.threads, self.say)
+
+
+class Computation(Presentation, WithProgress, OnDevice):
+    """Options of the commands that compute for long."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TableOptions:
+    """The options that the table of settings defines for a command.
+
+    They become path -> value of the settings given, those that are options of every command included; messages then refer to these
+    settings by option (`console.named`).
+    """
+
+    command: str
+
+    @cached_property
+    def rows(self) -> dict[str, Setting]:
+        """The settings by the name of the parameter."""
+        return {row.option.name.lstrip("-").replace("-", "_"): row for row in table.options_of(self.command)}
+
+    def parameters(self) -> list[inspect.Parameter]:
+        """The options as parameters for Typer."""
+        return [_parameter(name, row) for name, row in self.rows.items()]
+
+    def read(self, values: dict[str, Any]) -> dict[str, Any]:
+        """The settings given, from the values of all parameters of the command."""
+        rows = self.rows
+        said = {name: value for name in rows if not ((value := values[name]) is None or value is False or value == [])}
+        spoken = {path: rows[name].option.name for name in said for path in (rows[name].path, *rows[name].speaks_for)}
+        common = {name: row for name, row in COMMON.items() if values.get(name) is not None}
+        console.set_option_names(spoken | {row.path: row.option.name for row in common.values()})
+        given: dict[str, Any] = {row.path: values[name] for name, row in common.items()}
+        for name, value in said.items():
+            given |= _read(rows[name], value)
+        return given
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldOptions:
+    """An option for each field of a dataclass, whose metadata have its help and unit; they become a dictionary of those given."""
+
+    kind: type
+
+    def parameters(self) -> list[inspect.Parameter]:
+        """The options as parameters for Typer."""
+        return [_of_field(row) for row in dataclasses.fields(self.kind)]
+
+    def read(self, values: dict[str, Any]) -> dict[str, Any]:
+        """The fields given, from the values of all parameters of the command."""
+        return {row.name: value for row in dataclasses.fields(self.kind) if (value := values[row.name]) is not None}
+
+
+def command_of(body: Callable[[Any], None]) -> Callable[..., None]:
+    """A command for Typer that calls `body` with its only argument, made of the options that the class of this one declares."""
+    (given,) = (kind for name, kind in get_type_hints(body).items() if name != "return")
+    hints = get_type_hints(given, include_extras=True)
+    bases = given.__mro__[: given.__mro__.index(Given)]
+    declared = dict.fromkeys(name for base in bases for name in inspect.get_annotations(base))
+    groups, parameters = {}, []
+    for name in declared:
+        group = getattr(hints[name], "__metadata__", (None,))[0]
+        if isinstance(group, TableOptions | FieldOptions):
+            groups[name] = group
+            parameters += group.parameters()
+        else:
+            default = getattr(given, name, inspect.Parameter.empty)
+            parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name]))
+
+    def run(**values):
+        own = {name: value for name, value in values.items() if name in declared}
+        body(given(**own, **{name: group.read(values) for name, group in groups.items()}))
+
+    run.__signature__ = inspect.Signature(parameters)
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    run.__doc__ = body.__doc__
+    return run
 
 
 def _of_field(row: dataclasses.Field) -> inspect.Parameter:
@@ -401,6 +472,12 @@ def counts(option: str, text: str) -> tuple[int, ...]:
     if any(v != int(v) or v < 1 for v in values):
         raise InputError(f"{option} must be whole numbers of at least 1, got {text!r}")
     return tuple(int(v) for v in values)
+
+
+def refuse_alpha(alpha: float | None, reconstruction: str) -> None:
+    """Refuse an alpha of a filter that has none."""
+    if alpha is not None and reconstruction != "gaussian":
+        raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
 
 
 def both(values: tuple) -> list:

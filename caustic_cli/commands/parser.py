@@ -9,7 +9,7 @@ import typer
 from caustic_cli import __version__
 from caustic_cli.commands import console, convergence, design, export, gradmap, render
 from caustic_cli.commands.help import grouped
-from caustic_cli.commands.options import with_lists
+from caustic_cli.commands.options import command_of, with_lists
 
 DESCRIPTION = """Design free-form lenses that project a picture as a caustic.
 
@@ -41,11 +41,14 @@ def _root(
     pass
 
 
-for _module in (design, render, gradmap, export, convergence):
-    app.command(epilog=_module.EXAMPLES)(_module.run)
-# Typer names a command after its function; each module's is `run`.
-for _info, _name in zip(app.registered_commands, ("design", "render", "gradmap", "export", "convergence"), strict=True):
-    _info.name = _name
+for _name, _module in (
+    ("design", design),
+    ("render", render),
+    ("gradmap", gradmap),
+    ("export", export),
+    ("convergence", convergence),
+):
+    app.command(_name, epilog=_module.EXAMPLES)(command_of(_module.run))
 
 
 def parser():

@@ -18,13 +18,14 @@ EXAMPLES = """Examples:
 """
 
 
-@options.from_table("render")
-def run(
+class TracingOptions(options.Given):
+    """The lens, and how its light is traced."""
+
     project: Annotated[
         Path,
         typer.Argument(help="Project directory made by caustic design, or an .npz made by caustic export.", show_default=False),
-    ],
-    given: dict[str, Any],
+    ]
+    given: Annotated[dict[str, Any], options.TableOptions("render")]
     rays: Annotated[
         str | None,
         typer.Option(
@@ -33,32 +34,37 @@ def run(
             " wave at least 64 per pixel (at most 6.4e7); for other light up to 1.6e7 until the noise is a tenth of the"
             " error; with --tolerance, 1e6]",
         ),
-    ] = None,
+    ] = None
     tolerance: Annotated[
         float | None,
         typer.Option(
             metavar="ERROR",
             help="Add rays until the estimated noise of the image is below this relative RMS; --rays is the initial number.",
         ),
-    ] = None,
-    reconstruction: Annotated[
-        str, typer.Option(help="bincount, gaussian or cosine; the figures are always by bincount.")
-    ] = "bincount",
-    filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd (pixels).")] = "3",
-    alpha: Annotated[float | None, typer.Option(help="Alpha of the gaussian filter (1/mm^2).  [default: 1 per pixel^2]")] = None,
-    at: options.At = None,
-    screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Move the screen to this position (mm).")] = None,
+    ] = None
+    reconstruction: Annotated[str, typer.Option(help="bincount, gaussian or cosine; the figures are always by bincount.")] = (
+        "bincount"
+    )
+    filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd (pixels).")] = "3"
+    alpha: Annotated[float | None, typer.Option(help="Alpha of the gaussian filter (1/mm^2).  [default: 1 per pixel^2]")] = None
+    at: options.At = None
+    screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Move the screen to this position (mm).")] = None
     effects: Annotated[
         str,
         typer.Option(
             metavar="auto|none|NAME[,NAME...]",
             help="Effects to simulate: those that the scene needs, none that can be omitted, or the listed ones (see --explain).",
         ),
-    ] = "auto",
+    ] = "auto"
+
+
+class OutputOptions(options.Given):
+    """What is written."""
+
     explain: Annotated[
         bool,
         typer.Option("--explain", help="Show which effects are simulated, why, the cost of each, and the error of omitting it."),
-    ] = False,
+    ] = False
     output: Annotated[
         Path | None,
         typer.Option(
@@ -68,13 +74,13 @@ def run(
             help="Image to write, with the pixels of the screen.  [default: render.png in PROJECT, at least 800 pixels wide,"
             " unless a less noisy one of the same scene exists; for an archive, its name + -render.png, here]",
         ),
-    ] = None,
+    ] = None
     npy: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE", help="Also write the irradiance: power per pixel as a fraction of the source's, float64, [i, j]."
         ),
-    ] = None,
+    ] = None
     html: Annotated[
         Path | None,
         typer.Option(
@@ -82,7 +88,7 @@ def run(
             help="Also write a self-contained page that traces the lens in any browser: the lens in three dimensions,"
             " the caustic for movable screen and light, target and difference.",
         ),
-    ] = None,
+    ] = None
     verify: Annotated[
         str | None,
         typer.Option(
@@ -91,7 +97,7 @@ def run(
             " mitsuba) with as many rays and compare, pixel by pixel; writes"
             " verify.png beside the image.  Exit status 1 if they disagree.",
         ),
-    ] = None,
+    ] = None
     report: Annotated[
         bool,
         typer.Option(
@@ -100,14 +106,14 @@ def run(
             " radius, margin to internal reflection, sharpness, tolerances; writes report.json"
             " beside the image.",
         ),
-    ] = False,
+    ] = False
     tool_radius: Annotated[
         float | None,
         typer.Option(
             metavar="MM",
             help="Tool radius that --report checks in concave regions, and that of a --cut program that does not state it (mm).",
         ),
-    ] = None,
+    ] = None
     cut: Annotated[
         Path | None,
         typer.Option(
@@ -115,7 +121,7 @@ def run(
             help="Trace the surface machined by this program (G-code, as from caustic export --format gcode) with a ball-nose tool,"
             " including scallops.",
         ),
-    ] = None,
+    ] = None
     tolerances: Annotated[
         Path | None,
         typer.Option(
@@ -123,7 +129,7 @@ def run(
             help="Also analyse the manufacturing and alignment errors of this TOML file (like examples/tolerances.toml):"
             " sensitivities, percentiles of error and light, worst offenders; writes tolerances.csv and .png beside the image.",
         ),
-    ] = None,
+    ] = None
     want: Annotated[
         Path | None,
         typer.Option(
@@ -131,121 +137,74 @@ def run(
             help="For a lenslet array: the source brightness of each lenslet that gives this illumination (non-negative least"
             " squares over the images of the single lenslets); writes wanted.png beside the image.",
         ),
-    ] = None,
-    force: options.Force = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    progress: options.Progress = "auto",
-    seed: options.Seed = None,
-    device: options.Device = "auto",
-    dtype: options.Dtype = None,
-    threads: options.Threads = None,
-    debug: options.Debug = False,
-) -> None:
+    ] = None
+
+
+class RenderOptions(TracingOptions, OutputOptions, options.Computation):
+    """Arguments and options of caustic render."""
+
+
+def run(asked: RenderOptions) -> None:
     """Trace the lens of PROJECT; write the irradiance image and its figures of merit."""
-    say = console.Reporter(quiet, progress, json)
-    count = None if rays is None else options.rays("--rays", rays)
-    if tolerance is not None and not 0 < tolerance < 100:
-        raise InputError(f"--tolerance must be greater than 0 and less than 100, got {tolerance:g}")
-    size = options.both(options.counts("--filter-size", filter_size))
-    if tool_radius is not None and not ((report or cut) and tool_radius > 0):
-        raise InputError(f"--tool-radius belongs to --report and --cut and must be greater than 0 mm, got {tool_radius:g}")
-    designed = [name for name, there in (("--verify", verify), ("--explain", explain), ("--html", html)) if there]
-    if cut and designed:
-        raise InputError(f"--cut goes without {designed[0]}, which looks at the surface as designed")
-    if verify not in (None, "mitsuba"):
-        raise InputError(f"--verify must be mitsuba, got {verify!r}")
-    if verify and screen_at is not None:
-        raise InputError("--verify compares on the project's own screen: give no --screen-at")
-    if alpha is not None and reconstruction != "gaussian":
-        raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
-    given = {
-        path: value for path, value in given.items() if not path.startswith("design.")
-    }  # seed and dtype apply to this render's rays
-    if screen_at is not None:
+    say, rays, size = asked.say, None if asked.rays is None else options.rays("--rays", asked.rays), _checked_size(asked)
+    given = {path: value for path, value in asked.given.items() if not path.startswith("design.")}  # seed, dtype: of these rays
+    if asked.screen_at is not None:
         console.set_option_names(console.option_names() | {"screen.z": "--screen-at"})
-    options.require_project(project, archives=True)
+    options.require_project(asked.project, archives=True)
 
     from caustic_cli.config import tolerances as schema  # noqa: PLC0415
     from caustic_cli.config.values import refuse_bad_options  # noqa: PLC0415
 
     refuse_bad_options(given)
-    if tolerances is not None:
-        schema.read(tolerances)
-    device = options.start_torch(device, threads, say)
+    if asked.tolerances is not None:
+        schema.read(asked.tolerances)
+    device = asked.start_torch()
 
-    from caustic_cli.workflow.render import Request, render  # noqa: PLC0415
+    from caustic_cli.workflow.outputs import outputs_for  # noqa: PLC0415
+    from caustic_cli.workflow.outputs.base import Request, Tracing  # noqa: PLC0415
+    from caustic_cli.workflow.render import render  # noqa: PLC0415
 
-    asked = Request(
-        project,
-        count,
-        tolerance,
-        reconstruction,
-        size,
-        alpha,
-        given,
-        screen_at,
-        effects,
-        explain,
-        output,
-        npy,
-        html,
-        verify is not None,
-        report,
-        tool_radius,
-        cut,
-        force,
-        seed,
-        options.dtype_of(dtype or "float64"),
-        tolerances,
-        want,
-        at,
+    tracing = Tracing(
+        rays=rays,
+        tolerance=asked.tolerance,
+        reconstruction=asked.reconstruction,
+        filter_size=size,
+        alpha=asked.alpha,
+        given=given,
+        screen_at=asked.screen_at,
+        effects=asked.effects,
+        seed=asked.seed,
+        dtype=options.dtype_of(asked.dtype or "float64"),
     )
-    figures = render(asked, device, say)
-    _show(str(project), figures, say)
-    if json:
+    outputs = outputs_for(asked)
+    figures = render(Request(asked.project, tracing, outputs, asked.output, asked.at, asked.force), device, say)
+    say.table(str(asked.project), console.figures_rows(figures))
+    for output in outputs:
+        output.show(figures, say)
+    if asked.json:
         console.emit_json(figures)
-    if verify and not figures["verify"]["agree"]:
+    if asked.verify and not figures["verify"]["agree"]:
         raise CausticError(f"the image and Mitsuba's disagree by more than noise; see {figures['verify']['image']}")
 
 
-def _show(title: str, figures: dict, say: console.Reporter) -> None:
-    """Print the figures of merit and the requested reports."""
-    say.table(title, console.figures_rows(figures))
-    if "cut" in figures:
-        from caustic_cli.workflow.machining import rows as of_cut  # noqa: PLC0415
+def _checked_size(asked: RenderOptions) -> list[int]:
+    """The size of the filter, after a check of the options that are checked before the project is opened.
 
-        say.table(f"as {figures['cut']['program']} cuts it", of_cut(figures))
-    if "effects" in figures:
-        from caustic_cli.studies.effects import table  # noqa: PLC0415
-
-        say.result(*table(figures["effects"]))
-    if "report" in figures:
-        from caustic_cli.studies.manufacture import rows  # noqa: PLC0415
-
-        say.table("making the lens", rows(figures["report"]))
-    if "tolerances" in figures:
-        from caustic_cli.studies.tolerances import rows as of_tolerances  # noqa: PLC0415
-
-        say.table("tolerances", of_tolerances(figures["tolerances"]))
-    if "want" in figures:
-        from caustic_cli.workflow.illumination import rows as of_wanted  # noqa: PLC0415
-
-        say.table("brightness of the lenslets' sources", of_wanted(figures["want"]))
-    if "verify" in figures:
-        f = figures["verify"]
-        say.table(
-            f"Mitsuba {f['mitsuba']}, {f['variant']}",
-            [
-                ("decision", "agree" if f["agree"] else "DISAGREE"),
-                (
-                    "mean Z^2, beyond 3, largest",
-                    f"{f['z_mean_square']:.3f}, {f['z_beyond_3']:.2%}, {f['z_largest']:.2f}  (of noise: 1, 0.27%, 4)",
-                ),
-                ("judged", f"{f['pixels']:,} of {f['pixel_side']} x {f['pixel_side']} pixels, {f['noise']:.1%} noise each"),
-                ("relative RMS beyond noise", f"{f['relative_rms_beyond_noise']:.4f} of {f['relative_rms']:.4f}"),
-                ("light on the screen", f"{f['on_screen']:.6f}, render {f['on_screen_render']:.6f} ({f['light_z']:.1f} sigma)"),
-                ("correlation, and turned", f"{f['correlation']:.5f}, {f['correlation_turned']:.5f}"),
-                ("image", f["image"]),
-            ],
-        )
+    Raises:
+        InputError: one is out of range, or options exclude each other.
+    """
+    if asked.tolerance is not None and not 0 < asked.tolerance < 100:
+        raise InputError(f"--tolerance must be greater than 0 and less than 100, got {asked.tolerance:g}")
+    size = options.both(options.counts("--filter-size", asked.filter_size))
+    radius = asked.tool_radius
+    if radius is not None and not ((asked.report or asked.cut) and radius > 0):
+        raise InputError(f"--tool-radius belongs to --report and --cut and must be greater than 0 mm, got {radius:g}")
+    designed = [name for name in ("verify", "explain", "html") if getattr(asked, name)]
+    if asked.cut and designed:
+        raise InputError(f"--cut goes without --{designed[0]}, which looks at the surface as designed")
+    if asked.verify not in (None, "mitsuba"):
+        raise InputError(f"--verify must be mitsuba, got {asked.verify!r}")
+    if asked.verify and asked.screen_at is not None:
+        raise InputError("--verify compares on the project's own screen: give no --screen-at")
+    options.refuse_alpha(asked.alpha, asked.reconstruction)
+    return size

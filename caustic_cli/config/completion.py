@@ -13,7 +13,6 @@ import numpy as np
 
 from caustic_cli.config.design import relative_to_initial
 from caustic_cli.config.optional import (
-    complete_blank,
     complete_elements,
     complete_network,
     complete_second,
@@ -26,15 +25,13 @@ from caustic_cli.config.settings import Given, Settings, build_screen, build_sou
 from caustic_cli.config.table import LensSettings, Parameters, ScreenSettings, SourceSettings, TargetSettings, check
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
-from caustic_cli.kinds import complete_design
+from caustic_cli.kinds import complete_design, kind_of
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.scene import Offset, Source, sources
 from caustic_cli.scene.light import RGB
 
 DEFAULT_RESOLUTION = 250
 STEEPEST = 1.25  # least radius of a derived sphere in half diagonals of the lens: slopes up to 1.3
-PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a thin plate, and its least wall thickness, mm
-THICK, SAG = 2.0, 0.45  # thickness over width of a lens with two free-form sides, and largest height of a side over thickness
 OBLONG = 2.5  # anamorphic ratio of the magnifications from which on another lens shape is recommended
 COLOR_GLASS = "N-BK7"  # for a coloured picture without glass or index, since dispersion has to be known
 
@@ -154,23 +151,12 @@ def complete_screen(screen: ScreenSettings, target: TargetSettings, by: Paramete
     return screen.filled(resolution=(across, max(2, round(across * screen.size[1] / screen.size[0]))))
 
 
-def first_thickness(size: Sequence[float]) -> float:
-    """Default thickness of a lens, mm."""
-    width = max(size)
-    return width / 2.0 if width <= PLATE else WALL + width / 10.0
-
-
 def complete_lens(s: Settings, source: Source) -> LensSettings:
     """The lens with its base surface, which spreads the light over the picture, and room for the heights."""
-    index, scale, sides = index_of(s.lens), max(s.lens.size) / 10.0, 1 if s.second is None else 2
+    index, kind, free = index_of(s.lens), kind_of(s), "thickness" not in s.lens
     check("lens.index", index)
-    lens = complete_blank(s.lens, s.screen, index) if s.lens.gradient == "free" else s.lens
+    lens = kind.blank(s.lens, s.screen, index)
     lens = lens.filled(index=index) if lens.glass is None else lens.filled(wavelength=lens.wavelength)
-    free = "thickness" not in lens
-    lens = lens.filled(thickness=THICK * max(lens.size) if sides == 2 else first_thickness(lens.size))
-    lens = lens.filled(height_range=(-scale, scale) if sides == 1 else [c * SAG * lens.thickness for c in (-1.0, 1.0)])
-    if sides == 2:
-        lens = lens.filled(radius=(math.inf, math.inf))
     array, z = check("lens.array", lens.array), s.screen.z
     lowest, highest = (lens.thickness + height for height in lens.height_range)
     if lens.mirror and z >= lowest:
@@ -186,7 +172,7 @@ def complete_lens(s: Settings, source: Source) -> LensSettings:
         radius = Offset.for_magnification((across, along), -1.0 if lens.mirror else index, z, lens.thickness, vergence).radius
         least = STEEPEST * math.hypot(*lens.size) / 2.0  # an oblong picture or a near source may ask for a smaller radius
         lens = lens.changed(radius=[math.copysign(max(abs(r), least), r) for r in radius])
-    return lens.changed(thickness=lens.thickness + _missing_room(lens)) if free and sides == 1 else lens
+    return lens.changed(thickness=lens.thickness + _missing_room(lens)) if free and kind.adapts else lens
 
 
 def _missing_room(lens: LensSettings) -> float:

@@ -1,4 +1,4 @@
-"""Completion of optional features: networks trained over ranges, two free-form sides, other elements, a designed gradient index.
+"""Completion of optional features: networks trained over ranges, two free-form sides, other elements.
 
 Each function completes its own part of the settings, if present, for `completion`.
 """
@@ -12,12 +12,9 @@ from caustic_cli.config.settings import Settings, build_source
 from caustic_cli.config.table import (
     DesignSettings,
     ElementSettings,
-    LensSettings,
-    ScreenSettings,
     SecondSettings,
     SourceSettings,
     check,
-    check_all,
     default,
 )
 from caustic_cli.errors import InputError
@@ -26,8 +23,6 @@ from caustic_cli.scene.elements import check_compatible_with_elements
 
 OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
 BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
-#: For a free gradient: half range about the index; degree of its splines, knot spans per pixel and their largest number.
-HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS = 0.05, 3, 2, 768
 
 
 #: Settings that exclude a second target, other elements, and free-form surfaces of those: with any value but the default, or with
@@ -161,21 +156,3 @@ def _complete_element(element: ElementSettings, s: Settings) -> ElementSettings:
     lean = [math.cos(math.radians(t)) for t in check("element.tilt", element.tilt or (0.0, 0.0))]
     size = [w / c for w, c in zip(size, lean[::-1], strict=True)]
     return element.filled(size=[max(size)] * 2 if element.aperture == "circle" else size)
-
-
-def complete_blank(lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
-    """A plane-parallel blank whose gradient index is designed; its sides have the smallest control net."""
-    if lens.mirror:
-        raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
-    lens = lens.filled(radius=(math.inf, math.inf))
-    if any(map(math.isfinite, lens.radius)):
-        raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {list(lens.radius)}")
-    lens = lens.filled(
-        control=[p + 1 for p in check("lens.degree", lens.degree)],
-        index_range=(max(1.0, index - HALF_RANGE), index + HALF_RANGE),
-        index_control=[min(MOST_SPANS, INDEX_SPANS * n) + INDEX_DEGREE for n in screen.resolution],
-    )
-    check_all("lens", lens, "index_range", "index_control", "index_layers")
-    if not lens.index_range[0] < lens.index_range[1]:
-        raise InputError(f"⟨lens.index_range⟩ must ascend, got {list(lens.index_range)}")
-    return lens

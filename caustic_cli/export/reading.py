@@ -24,6 +24,7 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Aperture, FreeForm
+from caustic_cli.scene.aperture import UNBOUNDED
 
 #: Random points at which heights are compared.
 POINTS = 100_000
@@ -44,9 +45,9 @@ class Reading:
     heights: Tensor | None
     entrance: FreeForm | None = None
 
-    def largest_deviation(self, field: HeightField, heights: Tensor, aperture: Aperture) -> float:
-        """Largest deviation in height, mm, from a surface, control heights (n, m) mm, at random points of an aperture of its half
-        widths."""
+    def largest_deviation(self, field: HeightField, heights: Tensor, aperture: Aperture = UNBOUNDED) -> float:
+        """Largest deviation in height, mm, from a surface, control heights (n, m) mm, at random points of its rectangle
+        within an aperture."""
         random = np.random.default_rng(SEED)
         x, y = (torch.from_numpy(random.uniform(-r, r, POINTS)) for r in field.half_size)
         inside = aperture.contains(x, y)

@@ -230,7 +230,7 @@ def _within(field: HeightField, heights: Tensor, tolerance: float, decimals: int
     for part in PARTS:
         fewer, net = on_fewer_knots(field, heights, math.ceil(part * math.prod(field.shape)))
         read = of_poles(fewer, torch.from_numpy(net.numpy().round(decimals)))
-        if read.largest_deviation(field, heights, Aperture(field.half_size)) <= tolerance:
+        if read.largest_deviation(field, heights) <= tolerance:
             break
     return fewer, net
 

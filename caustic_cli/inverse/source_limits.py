@@ -26,6 +26,7 @@ from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Aperture, CircularAperture, Scene, Source
+from caustic_cli.scene.aperture import UNBOUNDED
 from caustic_cli.scene.sources.distribution import relative
 
 #: The blur is taken as a convolution where the deviation from it is at most this fraction of its half width.
@@ -152,7 +153,7 @@ def etendue_limit(scene: Scene) -> float | None:
         given = cell * part * seen[(np.arctan(slope) <= cone) & (relative(source.intensity, slope) > 0)].sum()
     else:
         return None
-    a, b, part = _area(screen.half_size, Aperture())
+    a, b, part = _area(screen.half_size, UNBOUNDED)
     px, py, pz = points_in_space(screen, a, b)
     taken = cell * part * _geometric_factor(x, y, (px, py, pz - lens.offset.thickness), normals(screen, a, b)).sum()
     return min(1.0, float(taken / given)) if given > 0 else None

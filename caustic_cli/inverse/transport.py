@@ -184,8 +184,8 @@ def solve(
             again = solve(source, target, source_half, target_half, **options)
             return replace(again, steps=steps + again.steps, seconds=time.perf_counter() - began)
         if failed:  # continuation from uniform light
-            *other, taken = _continued(linear, sites, raster, f, (a, b), enough, most)
-            steps += taken
+            *other, taken, all_taken = _continued(linear, sites, raster, f, (a, b), enough, most)
+            steps += all_taken
             found, error = min((found, error), other, key=lambda pair: pair[1])
         psi = found
     for _ in range(ROUNDS):
@@ -207,12 +207,13 @@ def _normalised(f: np.ndarray, darkest: float, half: tuple[float, float]) -> np.
 
 
 def _continued(psi: np.ndarray, sites: _Sites, raster, f: np.ndarray, half: tuple[float, float], enough: float, most: int):
-    """Prices by Newton's method in steps from uniform light to that of the source, their error, and the number of its steps."""
+    """Prices by Newton's method in steps from uniform light to that of the source, their error, and the numbers of its steps
+    for the source and in all."""
     steps = 0
     for even in EVENER:
         psi, error, taken = _newton(psi, sites, raster, _light(f, even, raster, *half), COARSE_TOLERANCE if even else enough, most)
         steps += taken
-    return psi, error, steps
+    return psi, error, taken, steps
 
 
 def _refined(psi: np.ndarray, coarser: _Sites, sites: _Sites, raster: list[np.ndarray], half: tuple[float, float]) -> np.ndarray:

@@ -16,13 +16,15 @@ import torch
 
 from caustic_cli.config.default_stages import refinement, transport_cells
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import LensSettings, check, default
+from caustic_cli.config.table import LensSettings, ScreenSettings, check, check_all, default
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.gradient_index import design_gradient_index
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.surface import OneSurface
 
+#: Half range about the index; degree of its splines, knot spans per pixel and their largest number.
+HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS = 0.05, 3, 2, 768
 RAYS_BENT = 16  # largest number of rays per pixel, since they cost more
 
 
@@ -36,6 +38,24 @@ class IndexPlate(OneSurface):
     @classmethod
     def applies(cls, s: Settings) -> bool:
         return s.lens.gradient == "free"
+
+    @classmethod
+    def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
+        """A plane-parallel blank; its sides have the smallest control net."""
+        if lens.mirror:
+            raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
+        lens = lens.filled(radius=(math.inf, math.inf))
+        if any(map(math.isfinite, lens.radius)):
+            raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {list(lens.radius)}")
+        lens = lens.filled(
+            control=[p + 1 for p in check("lens.degree", lens.degree)],
+            index_range=(max(1.0, index - HALF_RANGE), index + HALF_RANGE),
+            index_control=[min(MOST_SPANS, INDEX_SPANS * n) + INDEX_DEGREE for n in screen.resolution],
+        )
+        check_all("lens", lens, "index_range", "index_control", "index_layers")
+        if not lens.index_range[0] < lens.index_range[1]:
+            raise InputError(f"⟨lens.index_range⟩ must ascend, got {list(lens.index_range)}")
+        return super().blank(lens, screen, index)
 
     @classmethod
     def complete(cls, d: Defaults) -> None:

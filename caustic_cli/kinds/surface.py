@@ -24,7 +24,7 @@ from caustic_cli.config.default_stages import (
 )
 from caustic_cli.config.design import build_options, build_stages, relative_to_initial
 from caustic_cli.config.settings import Settings, build_screen
-from caustic_cli.config.table import check, default
+from caustic_cli.config.table import LensSettings, ScreenSettings, check, default
 from caustic_cli.config.wave_stages import wave_stages
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
@@ -59,6 +59,7 @@ from caustic_cli.studies.retrace import FINAL_RAYS, retrace
 
 DEFAULT_SPANS = 128  # knot spans of the final net; divisible by 2 through the stages
 NETWORK_CONTROL = 50  # table D.2
+PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a thin plate, and its least wall thickness, mm
 
 
 class Described(Protocol):
@@ -107,6 +108,17 @@ class OneSurface(Problem):
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
         """Further arguments of the constructor."""
         return {}
+
+    @classmethod
+    def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
+        """The lens with its default thickness and range of heights.
+
+        Raises:
+            InputError: a value is out of range, or two contradict each other.
+        """
+        width = max(lens.size)
+        lens = lens.filled(thickness=width / 2.0 if width <= PLATE else WALL + width / 10.0)
+        return lens.filled(height_range=(-width / 10.0, width / 10.0))
 
     @classmethod
     def complete(cls, d: Defaults) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from caustic_cli.config.default_stages import TWO_SIDED_SPANS, refinement_spans, two_sided
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import check
+from caustic_cli.config.table import LensSettings, ScreenSettings, check
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import InitialSurface
@@ -31,6 +32,7 @@ from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures
 
+THICK, SAG = 2.0, 0.45  # thickness over width of the lens, and largest height of a side over thickness
 #: Divisor of the rays for the initial surfaces.
 STARTS = 4
 
@@ -56,6 +58,11 @@ class TwoSides(SeveralSurfaces):
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
         second = described.second_target(scene)
         return {"second": None if second is None else torch.from_numpy(second)}
+
+    @classmethod
+    def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
+        lens = lens.filled(thickness=THICK * max(lens.size), radius=(math.inf, math.inf))
+        return lens.filled(height_range=[c * SAG * lens.thickness for c in (-1.0, 1.0)])
 
     @classmethod
     def complete(cls, d: Defaults) -> None:

@@ -12,7 +12,7 @@ from caustic_cli.optics.frames import rotate_to_global
 from caustic_cli.optics.interface import OutgoingRays
 from caustic_cli.optics.media import Medium
 from caustic_cli.optics.rays import Hit, RayState
-from caustic_cli.optics.system import Element, System
+from caustic_cli.optics.system import System
 
 #: Control heights (n, m), mm, by the name of the element.
 Parameters = Mapping[str, Tensor]
@@ -67,15 +67,10 @@ class Interaction:
     power_in: Tensor | None = None
     out: OutgoingRays | None = None
 
-    @property
-    def element(self) -> Element:
-        """The element."""
-        return self.tracer.system.elements[self.index]
-
-    @property
-    def side(self) -> float:
-        """The side from which light reaches the surface: +1 from below, -1 from above."""
-        return self.tracer.sides[self.index] if self.forward else -self.tracer.sides[self.index]
+    def __post_init__(self):
+        #: The element, and the side from which light reaches it: +1 from below, -1 from above.
+        self.element = self.tracer.system.elements[self.index]  # the tracer may be gone when this is read
+        self.side = self.tracer.sides[self.index] if self.forward else -self.tracer.sides[self.index]
 
     @property
     def ahead(self) -> int:

@@ -16,14 +16,14 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.scene import Aperture
+from caustic_cli.scene.aperture import UNBOUNDED, Aperture
 
 #: Samplers with tensor-product structure, and all samplers.
 TENSOR = ("grid", "lines")
@@ -162,7 +162,7 @@ class Sampler:
     seed: int = 0
     profile: Tensor | None = None
     device: str | torch.device = "cpu"
-    aperture: Aperture = field(default_factory=Aperture)
+    aperture: Aperture = UNBOUNDED
 
     def __post_init__(self):
         if self.kind not in SAMPLERS:

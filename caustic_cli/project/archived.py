@@ -30,11 +30,6 @@ class ArchivedLens:
     seed = 0
     encoding = "srgb"
 
-    @classmethod
-    def open(cls, path: str | Path) -> ArchivedLens:
-        """As `Project.open`; the archive is read by `read`."""
-        return cls(Path(path))
-
     def at(self, text: str | None) -> ArchivedLens:
         """Refuse parameter values of a network."""
         if text is not None:
@@ -85,6 +80,6 @@ def origin_of(path: str | Path, at: str | None = None) -> Project | ArchivedLens
     Raises:
         InputError: there is neither, or there is no such network.
     """
-    archived = Path(path).suffix.lower() == ".npz" and Path(path).is_file()
-    origin: type[Project | ArchivedLens] = ArchivedLens if archived else Project
-    return origin.open(path).at(at)
+    archive = Path(path)
+    archived = archive.suffix.lower() == ".npz" and archive.is_file()
+    return ArchivedLens(archive).at(at) if archived else Project.open(path).at(at)

@@ -163,6 +163,8 @@ class CircularAperture(Aperture):
         return math.sqrt(max(0.0, self.radius * self.radius - at * at))
 
 
+#: The aperture of an unbounded surface.
+UNBOUNDED = Aperture()
 #: Apertures by their names among the settings.
 APERTURES: dict[str, type[Aperture]] = {shape.name: shape for shape in (Aperture, CircularAperture)}
 

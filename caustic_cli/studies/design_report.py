@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 
@@ -45,6 +46,30 @@ PLACES = {"left": 0.035, "right": 0.95, "bottom": 0.065, "top": 0.925, "wspace":
 LESS, BETWEEN = 0.5, 0.6
 
 
+@dataclass(frozen=True)
+class Judge:
+    """An image by which a lens can be judged."""
+
+    by: str
+    #: Of the keys of its figures.
+    prefix: str
+    #: What its errors are of, the title of the energy balance beside it, and what is said of its figures among those by rays.
+    points: str
+    balance: str
+    beside_rays: str
+
+
+JUDGES = {
+    False: Judge("rays", "", "retraced with independent rays", "where the light goes", ""),
+    True: Judge("waves", "wave_", "wave image of the lens", "where the light goes, by rays", ", by waves"),
+}
+
+
+def judge_of(figures: dict) -> Judge:
+    """The wave image if there is one."""
+    return JUDGES[figures.get("wave_relative_rms") is not None]
+
+
 def write_report(
     path: Path,
     target: np.ndarray,
@@ -77,45 +102,10 @@ def write_report(
     figure = plt.figure(figsize=(22.0, 9.8))
     axes = figure.subplots(2, 4, gridspec_kw=PLACES)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
-
-    def titled(name: str, relative: float | None) -> str:
-        return name if relative is None else f"{name}\nrelative RMS error {relative:.3f}"
-
-    def absolute(picture: np.ndarray, prefix: str = "") -> np.ndarray:
-        return picture * (figures[f"{prefix}peak_irradiance"] / (picture.max() or 1.0))
-
-    if waves is None:
-        title = titled("caustic", figures["relative_rms"])
-        if "least_relative_rms" in figures:
-            title += f", at least {figures['least_relative_rms']:.3f}"
-        judged = absolute(image)
-        shown = [(judged, title, "")]
-    else:
-        judged = absolute(waves, "wave_")
-        shown = [
-            (absolute(image), titled("ray image", figures["relative_rms"]), ""),
-            (judged, titled("wave image", figures["wave_relative_rms"]), "wave_"),
-        ]
-        image = waves
-    goal = target * (judged.sum() / target.sum())
-    white = max(float(goal.max()), float(judged.max()))  # of both
-    for axis, (picture, title, prefix) in zip(axes[0], [(goal, "target", None), *shown], strict=False):
-        top = white if picture is goal or picture is judged else float(picture.max())
-        top = top if top > DARK else 1.0
-        norm = (
-            FuncNorm((lambda e, w=top: to_srgb(e / w), lambda v, w=top: w * to_linear(v)), 0.0, top, clip=True)
-            if encoding == "srgb"
-            else Normalize(0.0, top, clip=True)
-        )
-        drawn = _draw_image(axis, picture, extent, title, cmap="gray", norm=norm)
-        if prefix is not None:
-            _bar(drawn, axis, _irradiance_words(figures, prefix))
-    error = (image / max(image.sum(), 1e-300) - target / target.sum()) * target.size
-    most = _scale_of(error, (image > 0) | (target > 0))
-    axis = axes[0, len(shown) + 1]
-    drawn = _draw_image(axis, error, extent, "error: too dark (blue), too bright (red)", cmap="coolwarm", vmin=-most, vmax=most)
-    _bar(drawn, axis, "of the mean irradiance", extend="both")
-    if waves is None:
+    shown = _images(image, waves, figures)
+    _draw_images(axes[0], target, shown, figures, extent, encoding)
+    _draw_error(axes[0, len(shown) + 1], target, image if waves is None else waves, extent)
+    if len(shown) == 1:
         _draw_section(axes[0, 3], target, image, screen)
     rx, ry = lens.half_size
     volume = None if lens.gradient is None else lens.gradient.volume
@@ -135,6 +125,54 @@ def write_report(
     with atomic_file(path) as file:
         figure.savefig(file, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)
+
+
+def _images(image: np.ndarray, waves: np.ndarray | None, figures: dict) -> list[tuple[np.ndarray, str, str]]:
+    """Irradiance, title, and prefix of the figures of each image, that which judges the lens last."""
+
+    def absolute(picture: np.ndarray, title: str, prefix: str) -> tuple[np.ndarray, str, str]:
+        error = figures[f"{prefix}relative_rms"]
+        words = title if error is None else f"{title}\nrelative RMS error {error:.3f}"
+        return picture * (figures[f"{prefix}peak_irradiance"] / (picture.max() or 1.0)), words, prefix
+
+    if waves is not None:
+        return [absolute(image, "ray image", ""), absolute(waves, "wave image", "wave_")]
+    judged, title, prefix = absolute(image, "caustic", "")
+    least = f", at least {figures['least_relative_rms']:.3f}" if "least_relative_rms" in figures else ""
+    return [(judged, title + least, prefix)]
+
+
+def _draw_images(
+    axes: Sequence[Axes],
+    target: np.ndarray,
+    shown: list[tuple[np.ndarray, str, str]],
+    figures: dict,
+    extent: Sequence[float],
+    encoding: str,
+) -> None:
+    """The target and the images; the target and the one that judges the lens at the same exposure."""
+    judged = shown[-1][0]
+    goal = target * (judged.sum() / target.sum())
+    white = max(float(goal.max()), float(judged.max()))  # of both
+    for axis, (picture, title, prefix) in zip(axes, [(goal, "target", None), *shown], strict=False):
+        top = white if picture is goal or picture is judged else float(picture.max())
+        top = top if top > DARK else 1.0
+        norm = (
+            FuncNorm((lambda e, w=top: to_srgb(e / w), lambda v, w=top: w * to_linear(v)), 0.0, top, clip=True)
+            if encoding == "srgb"
+            else Normalize(0.0, top, clip=True)
+        )
+        drawn = _draw_image(axis, picture, extent, title, cmap="gray", norm=norm)
+        if prefix is not None:
+            _bar(drawn, axis, _irradiance_words(figures, prefix))
+
+
+def _draw_error(axis: Axes, target: np.ndarray, image: np.ndarray, extent: Sequence[float]) -> None:
+    """The difference of image and target, each over its own mean."""
+    error = (image / max(image.sum(), 1e-300) - target / target.sum()) * target.size
+    most = _scale_of(error, (image > 0) | (target > 0))
+    drawn = _draw_image(axis, error, extent, "error: too dark (blue), too bright (red)", cmap="coolwarm", vmin=-most, vmax=most)
+    _bar(drawn, axis, "of the mean irradiance", extend="both")
 
 
 def _draw_image(
@@ -236,40 +274,58 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
     Losses by rays and by waves, and with a blur and without, have panels of their own: they cannot be compared with each other.
     """
     found = [int(k) for k in np.unique(history[:, 1])]
-    how = {k: stages[k] if k < len(stages) else (0.0, False) for k in found}
-    by_waves = figures.get("wave_relative_rms") is not None
-    kinds = list(dict.fromkeys((waves, blur > 0) for blur, waves in how.values()))  # in the order of the stages
-    if (by_waves, False) not in kinds:
-        kinds.append((by_waves, False))
+    stage = {k: stages[k] if k < len(stages) else (0.0, False) for k in found}
+    how = {k: (blur, JUDGES[waves]) for k, (blur, waves) in stage.items()}
+    judging = judge_of(figures)
+    kinds = list(dict.fromkeys((judge, blur > 0) for blur, judge in how.values()))  # in the order of the stages
+    if (judging, False) not in kinds:
+        kinds.append((judging, False))
     grid = axis.get_subplotspec().subgridspec(
-        len(kinds), 1, height_ratios=[1.0 if kind == (by_waves, False) else LESS for kind in kinds], hspace=BETWEEN
+        len(kinds), 1, height_ratios=[1.0 if kind == (judging, False) else LESS for kind in kinds], hspace=BETWEEN
     )
     axis.set_subplotspec(grid[0])
     panels = {kinds[0]: axis}
     panels |= {kind: axis.get_figure().add_subplot(grid[k], sharex=axis) for k, kind in enumerate(kinds) if k > 0}
     last = history[-1, 4] if len(history) else 0.0
-    for k, (blur, waves) in how.items():
-        rows, colour, own = history[history[:, 1] == k], COLOURS[k % len(COLOURS)], panels[waves, blur > 0]
-        own.semilogy(rows[:, 4], rows[:, 2] * pixels, color=colour, marker="." if len(rows) == 1 else None, lw=1.6)
-        at, up = (rows[0], 4) if blur == 0 or k % 2 == 0 else (rows[-1], -11)  # above one line and below the next: many are short
-        late = at[4] > 0.7 * last
-        own.annotate(
-            f"{blur:.2g} px" if blur > 0 else f"stage {k + 1}",
-            (at[4], at[2] * pixels),
-            xytext=(-3 if late else 3, up),
-            textcoords="offset points",
-            ha="right" if late else "left",
-            color=colour,
-            fontsize="small",
-        )
-    likeness, judge = ("wave_relative_rms", panels[True, False]) if by_waves else ("relative_rms", panels[False, False])
-    least = min((float(line.get_ydata()[-1]) for line in judge.get_lines()), default=0.0)
-    for key, at, words in ((f"start_{likeness}", 0.0, "start"), (likeness, last, "finished")):
+    for k, (blur, judge) in how.items():
+        _draw_stage(panels[judge, blur > 0], k, blur, history[history[:, 1] == k], pixels, last)
+    _draw_errors(panels[judging, False], figures, judging.prefix, last)
+    for kind, own in panels.items():
+        own.set_title(_loss_words(*kind, points=own is panels[judging, False]), fontsize="medium")
+        own.margins(x=0.08, y=0.12 if own is panels[judging, False] else 0.8)  # room for the names of the stages
+        own.set_ylabel("relative RMS")
+        own.grid(alpha=0.3, which="both")
+        plain_ticks(own.yaxis)
+        own.tick_params(labelbottom=own is panels[kinds[-1]])
+    panels[kinds[-1]].set_xlabel("s")
+
+
+def _draw_stage(axis: Axes, k: int, blur: float, rows: np.ndarray, pixels: int, last: float) -> None:
+    """The losses of stage k, `rows` of the history, which ends after `last` seconds."""
+    colour = COLOURS[k % len(COLOURS)]
+    axis.semilogy(rows[:, 4], rows[:, 2] * pixels, color=colour, marker="." if len(rows) == 1 else None, lw=1.6)
+    at, up = (rows[0], 4) if blur == 0 or k % 2 == 0 else (rows[-1], -11)  # above one line and below the next: many are short
+    late = at[4] > 0.7 * last
+    axis.annotate(
+        f"{blur:.2g} px" if blur > 0 else f"stage {k + 1}",
+        (at[4], at[2] * pixels),
+        xytext=(-3 if late else 3, up),
+        textcoords="offset points",
+        ha="right" if late else "left",
+        color=colour,
+        fontsize="small",
+    )
+
+
+def _draw_errors(axis: Axes, figures: dict, prefix: str, last: float) -> None:
+    """The errors of the initial lens and of the final one after `last` seconds as points; prefix: of the figures of the image."""
+    least = min((float(line.get_ydata()[-1]) for line in axis.get_lines()), default=0.0)
+    for key, at, words in ((f"start_{prefix}relative_rms", 0.0, "start"), (f"{prefix}relative_rms", last, "finished")):
         if figures.get(key):
-            judge.semilogy([at], [figures[key]], "o", color="black", ms=5, mfc="none" if at == 0.0 else "black")
+            axis.semilogy([at], [figures[key]], "o", color="black", ms=5, mfc="none" if at == 0.0 else "black")
             away = 10 if least < figures[key] else -10
             side = {"xytext": (6, 0), "ha": "left"} if at == 0.0 else {"xytext": (0, away), "ha": "right"}
-            judge.annotate(
+            axis.annotate(
                 f"{words} {figures[key]:.3f}",
                 (at, figures[key]),
                 textcoords="offset points",
@@ -278,24 +334,15 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
                 **side,
             )
-    for kind, own in panels.items():
-        own.set_title(_loss_words(*kind, points=own is judge), fontsize="medium")
-        own.margins(x=0.08, y=0.12 if own is judge else 0.8)  # room for the names of the stages
-        own.set_ylabel("relative RMS")
-        own.grid(alpha=0.3, which="both")
-        plain_ticks(own.yaxis)
-        own.tick_params(labelbottom=own is panels[kinds[-1]])
-    panels[kinds[-1]].set_xlabel("s")
 
 
-def _loss_words(waves: bool, blurred: bool, points: bool) -> str:
+def _loss_words(judge: Judge, blurred: bool, points: bool) -> str:
     """Title of a panel of losses."""
     if blurred:
-        return f"loss by {'waves' if waves else 'rays'} of each stage, with blur"
+        return f"loss by {judge.by} of each stage, with blur"
     if not points:
-        return f"loss by {'waves' if waves else 'rays'}"
-    judge = "wave image of the lens" if waves else "retraced with independent rays"
-    return f"error by {'waves' if waves else 'rays'}: loss of the design (lines),\n{judge} (points)"
+        return f"loss by {judge.by}"
+    return f"error by {judge.by}: loss of the design (lines),\n{judge.points} (points)"
 
 
 def _draw_energy_balance(axis: Axes, figures: dict) -> None:
@@ -314,13 +361,13 @@ def _draw_energy_balance(axis: Axes, figures: dict) -> None:
 def _balance_words(figures: dict) -> str:
     """Title of the energy balance: the fraction of all that the source emits, light in black regions of the image that the lens is
     judged by, and what a least radius adds to that."""
-    waves, radius = figures.get("wave_relative_rms") is not None, figures.get("min_radius")
-    words, black = ("where the light goes, by rays", "wave_in_black") if waves else ("where the light goes", "in_black")
+    judge, radius = judge_of(figures), figures.get("min_radius")
+    words, black = judge.balance, figures.get(f"{judge.prefix}in_black")
     seen = figures["wave_on_target"] if figures.get("error_by") == "waves" else figures["on_target"]
     if figures.get("of_source") is not None and not math.isclose(figures["of_source"], seen):  # it emits beside the lens, too
         words += f"\non the picture {100.0 * figures['of_source']:.3g} % of all that the source emits"
-    if figures.get(black) is not None:
-        words += f"\nof that on the screen, in black {figures[black]:.2%}{', by waves' if waves else ''}"
+    if black is not None:
+        words += f"\nof that on the screen, in black {black:.2%}{judge.beside_rays}"
     if radius is not None and radius["in_black_per_mm"] is not None:
         words += f"\na radius of {radius['radius_mm']:g} mm on the first surface, in black: {cost_of_radius(radius)}"
     return words

@@ -72,7 +72,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     bent, at = float(bends.max()), divmod(int(bends.argmax()), bends.shape[1])
     where = [(2.0 * k / (n - 1) - 1.0) * r for k, n, r in zip(at, z.shape, field.half_size, strict=True)]
     radius = 1.0 / bent if bent > 0 else None
-    volume = 1e-3 * float(z[inside].mean() - lens.z_in) * lens.opening.area
+    volume = 1e-3 * float(z[inside].mean() - lens.z_in) * math.prod(lens.size) * (lens.opening.filled / 4.0)
     found = {
         "minimum_wall_mm": float(z.min()) - lens.z_in,
         "minimum_wall_bound_mm": float(heights.min()) - lens.z_in,

@@ -13,8 +13,10 @@ E'^2 - s^2 <= MARGIN^2 (E^2 - s^2).
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -39,51 +41,40 @@ EACH, EACH_OTHER, LEAST = 256, 64, 250_000
 
 
 class PictureError:
-    """Errors of one lens' picture, through its own surface and through others.
+    """Errors of one lens' picture by rays, through its own surface and through others.
 
     Args:
         plan: of the scene; field, heights: of its exit, (n, m) mm.
-        target: (n_x, n_y) or (3, n_x, n_y); None for the image of the lens itself.
-        waves: judge by the wave image.
-        seed: of the rays.
+        target: (n_x, n_y) or (3, n_x, n_y), None if it is not known; seed: of the rays.
     """
 
-    def __init__(self, plan: Plan, field: HeightField, heights: Tensor, target: np.ndarray | None, waves: bool, seed: int = 0):
+    #: What judges the picture, rays or waves, and whether it is known; otherwise images are compared with that of the lens.
+    by: ClassVar[str] = "rays"
+    known: ClassVar[bool] = True
+
+    def __init__(self, plan: Plan, field: HeightField, heights: Tensor, target: np.ndarray | None, seed: int = 0):
         self.plan, self.field, self.heights, self.seed = plan, field, heights.detach(), seed
-        self.known, self._target, self._waves = target is not None, target, waves and target is not None
-
-    @property
-    def by(self) -> str:
-        """What judges the picture: waves or rays."""
-        return "waves" if self._waves and self._own_by_waves is not None else "rays"
+        self.target = target
 
     @cached_property
-    def _own_by_waves(self) -> float | None:
-        return self._by_waves(self.plan.scene, self.field, self.heights)
-
-    @cached_property
-    def _own_by_rays(self) -> tuple[np.ndarray, dict]:
-        image, figures = self._by_rays(self.plan.scene, self.field, self.heights, noise=True)
-        return image, figures if self.known else figures | {"relative_rms": 0.0, "noise": None}
+    def _own(self) -> tuple[np.ndarray, dict]:
+        """Image and figures of the lens itself."""
+        return self._retrace(self.plan.scene, self.field, self.heights, noise=True)
 
     @property
     def own(self) -> float:
         """Relative RMS error of the lens itself; 0 if its picture is not known."""
-        return self._own_by_waves if self.by == "waves" else self._own_by_rays[1]["relative_rms"]
+        return self._own[1]["relative_rms"]
 
     @property
     def noise(self) -> float | None:
-        """Standard error of the figures by rays, which is common to both surfaces; None by waves."""
-        return None if self.by == "waves" else self._own_by_rays[1]["noise"]
+        """Standard error of the figures, which is common to both surfaces; None where there is none."""
+        return self._own[1]["noise"]
 
     @cached_property
     def largest(self) -> float:
         """Largest error of a surface that keeps the picture."""
-        if not self.known:
-            return self.own + UNKNOWN
-        noise = 0.0
-        if self.by == "rays" and self.plan.scene.source.collimated:
-            noise = min(self._own_by_rays[1]["error_estimate"] or 0.0, self.own)
+        noise = min(self._own[1]["error_estimate"] or 0.0, self.own) if self.plan.scene.source.collimated else 0.0
         return float(np.sqrt(noise**2 + MARGIN**2 * (self.own**2 - noise**2)))
 
     def through(self, surface: HeightField | MeasuredSurface, heights: Tensor | None, entrance: FreeForm | None = None) -> float:
@@ -93,20 +84,18 @@ class PictureError:
             return self.own  # stored exactly
         if entrance is not None:
             scene = replace(scene, lens=replace(scene.lens, entrance=entrance))
-        if self.by == "waves":
-            found = self._by_waves(scene, surface, heights)
-            return np.inf if found is None else found
-        if self.known:
-            return self._by_rays(scene, surface, heights)[1]["relative_rms"]
-        return relative_rms(self._by_rays(scene, surface, heights)[0], self._own_by_rays[0])
+        return self._error(scene, surface, heights)
 
-    def _by_rays(self, scene: Scene, surface, heights: Tensor | None, noise: bool = False) -> tuple[np.ndarray, dict]:
+    def _error(self, scene: Scene, surface: HeightField | MeasuredSurface, heights: Tensor | None) -> float:
+        return self._retrace(scene, surface, heights)[1]["relative_rms"]
+
+    def _retrace(self, scene: Scene, surface, heights: Tensor | None, noise: bool = False) -> tuple[np.ndarray, dict]:
         each = EACH if scene.source.collimated else EACH_OTHER
         image, figures = retrace(
             scene,
             surface,
             self.heights if heights is None else heights,
-            self._target,
+            self.target,
             rays=max(LEAST, each * int(np.prod(scene.screen.resolution))),
             seed=self.seed,
             requests=self.plan.requests,
@@ -114,8 +103,37 @@ class PictureError:
         )
         return image.image.cpu().numpy(), figures
 
-    def _by_waves(self, scene: Scene, surface, heights: Tensor | None) -> float | None:
-        """Error of the wave image, None if there is none."""
+
+class ImageDifference(PictureError):
+    """Of a lens whose picture is not known: differences from its own image by rays."""
+
+    known: ClassVar[bool] = False
+
+    @cached_property
+    def _own(self) -> tuple[np.ndarray, dict]:
+        image, figures = self._retrace(self.plan.scene, self.field, self.heights, noise=True)
+        return image, figures | {"relative_rms": 0.0, "noise": None}
+
+    @cached_property
+    def largest(self) -> float:
+        """Largest difference of a surface that keeps the image."""
+        return UNKNOWN
+
+    def _error(self, scene: Scene, surface: HeightField | MeasuredSurface, heights: Tensor | None) -> float:
+        return relative_rms(self._retrace(scene, surface, heights)[0], self._own[0])
+
+
+class PictureErrorByWaves(PictureError):
+    """Errors of the wave image, infinite where there is none."""
+
+    by: ClassVar[str] = "waves"
+
+    @cached_property
+    def _own(self) -> tuple[np.ndarray, dict]:
+        error = self._error(self.plan.scene, self.field, self.heights)
+        return np.empty((0, 0)), {"relative_rms": error, "noise": None, "error_estimate": None}
+
+    def _error(self, scene: Scene, surface: HeightField | MeasuredSurface, heights: Tensor | None) -> float:
         perturbation = None
         if isinstance(surface, MeasuredSurface):
             perturbation = height_deviation(surface, self.field, self.heights)
@@ -125,11 +143,24 @@ class PictureError:
                 scene,
                 surface,
                 heights,  # type: ignore[arg-type]
-                self._target,
+                self.target,
                 Resolution.at(scene, self.field, self.heights),
                 required=False,
                 perturbation=perturbation,
             )[1]
         except NoWaveImage:
-            return None
-        return figures["wave_relative_rms"]
+            return math.inf
+        return math.inf if figures["wave_relative_rms"] is None else figures["wave_relative_rms"]
+
+
+def picture_error(
+    plan: Plan, field: HeightField, heights: Tensor, target: np.ndarray | None, waves: bool, seed: int = 0
+) -> PictureError:
+    """The errors of a picture by waves if they are asked for and the lens has a wave image, otherwise by rays; differences from the
+    image of the lens itself if the target is None."""
+    lens = plan, field, heights, target, seed
+    if target is None:
+        return ImageDifference(*lens)
+    if waves and math.isfinite((found := PictureErrorByWaves(*lens)).own):
+        return found
+    return PictureError(*lens)

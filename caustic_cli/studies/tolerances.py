@@ -16,11 +16,7 @@ of F^2, nearly a sum over parameters, then has a much smaller variance than with
 points of the lens (common random numbers).
 
 Images are those of two independent halves of the rays, A and B, whose noise drops out of F^2 = mean((a - t) (b - t))
-(`studies.noise`).  For a lens refined on its wave image, the wave image is warped instead: light at q moves to q + u(q), with u the
-mean displacement of the rays that land near q.  Surface errors change the interference, so each of a few realisations of them has
-its own wave image, which is warped by the other errors.  These change the phase only slightly over the width of a detail; the error
-of this approximation is measured for the draw at the 95th percentile with its own wave image, as far as index, thickness, throw and
-source are concerned.
+(`studies.noise`).  A lens refined on its wave image is evaluated by that (`studies.tolerances_by_waves`).
 
 A decentred or tilted lens displaces the picture as a whole, which a shift of the screen can compensate: F is given as placed, and
 also after the best shift of the screen for each draw (compensator).
@@ -33,12 +29,13 @@ import io
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from caustic_cli import __version__
@@ -62,22 +59,10 @@ RAYS = 200_000
 REALISATIONS = 4
 #: Number of the first of those realisations, beyond all draws.
 ALONE = 10**6
-#: Realisations of the surface errors with a wave image, which the draws use cyclically.
-REALISED = 8
-#: Errors that can be included in the computation of a wave image.
-WAVED = ("index", "thickness", "throw", "source_shift", "source_distance", "source_size")
 #: Fraction of the draws that count as the worst.
 WORST = 0.05
 #: Bootstrap samples for the standard error of a percentile.
 RESAMPLED = 400
-#: Fixed-point iterations of the inverse displacement.
-BACK = 4
-#: Least width, pixels, of the average of displacements.
-NEAR = 1.5
-#: Factor by which fewer rays suffice for displacements, which are smooth.
-FEWER = 5
-#: Least irradiance over its mean for which a displacement is estimated.
-LIT = 1e-3
 #: Factor by which more rays are used for the lens without errors.
 NOMINAL = 8
 #: Uniform slope of the exit, a finite-difference step for the effect of roughness.
@@ -103,15 +88,19 @@ class TrialFigures:
 
 
 class Trials:
-    """Evaluation of a lens under given errors.
+    """Evaluation of a lens under given errors, by ray images.
 
     Args:
         scene, field, heights, requests: of a plan; heights (n, m) mm.
         target: (n_x, n_y) or, of a coloured scene, (3, n_x, n_y).
         tolerances: distributions of the errors.
-        waves: function that returns the wave image of heights in a scene, of the target's shape; None for ray images.
-        near: pixels over which displacements are averaged for wave images.
+        rays: of a draw.
     """
+
+    #: By what images: rays, or waves (`tolerances_by_waves`).
+    by: ClassVar[str] = "rays"
+    #: Divisor of the number of rays: 2, as there are two halves.
+    divisor: ClassVar[int] = 2
 
     def __init__(
         self,
@@ -123,20 +112,14 @@ class Trials:
         *,
         rays: int = RAYS,
         requests: Requests = NO_REQUESTS,
-        waves: Callable[[Scene, HeightField, Tensor], np.ndarray] | None = None,
-        near: float = NEAR,
     ):
         self.scene, self.requests, self.tolerances = scene, requests, tolerances
         self.field, self.heights = refined(field, heights.detach().double().cpu(), tolerances.shortest)
         self.target = target if target.ndim == 3 else target[None]
-        self.waves = waves
-        self.rays, self.near = max(2, rays // (2 if waves is None else FEWER)), max(near, NEAR)
+        self.rays = max(2, rays // self.divisor)
         self.parameters = tuple(p for p in tolerances.parameters if not reason_ignored(scene, p.error))
         self.surfaces = FormErrors(self.field, tolerances.form, tolerances.waviness) if tolerances.surface else None
         self.gain: tuple[float, float] | None = None
-        self.smooth: dict[tuple[int, tuple[str, ...]], list[np.ndarray]] = {}
-        if waves is not None:
-            self.begin = self._rays(Misalignment(), self.heights, 0)
 
     def evaluate(self, values: Values, number: int | None = None, which: tuple[str, ...] | None = None) -> TrialFigures:
         """Figures under errors by (name, axis), and a realisation of the surface errors, all of them or only `which`."""
@@ -147,52 +130,32 @@ class Trials:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Images of the two halves of the rays, (colours, n_x, n_y) each, fractions of the source's power; twice the same for
         waves."""
-        errors, which = Misalignment.of(values), self.tolerances.surface if which is None else which
-        which = which if number is not None else ()
-        if self.waves is None:
-            heights = self.heights + self.surface(number, which) if which and number is not None else self.heights
-            pair = [self._image(self._rays(errors, heights, half)) for half in (0, 1)]
-        else:
-            light = self._wave_image(number % REALISED if which and number is not None else 0, which)
-            pair = [self._moved(self._rays(errors, self.heights, 0), light)] * 2
+        which = self.tolerances.surface if which is None else which
+        pair = self._pair(Misalignment.of(values), number if which else None, which)
         rough = abs(values.get(("roughness", 0), 0.0))
         if rough > 0:
             width = [rough * g / p for g, p in zip(self._gain(), self.scene.screen.pixel, strict=True)]
             pair = [np.stack([gaussian_filter(c, width, mode="constant") for c in one]) for one in pair]
         return pair[0], pair[1]
 
+    def _pair(self, errors: Misalignment, number: int | None, which: tuple[str, ...]) -> list[np.ndarray]:
+        """The images without roughness; number: of the realisation of the surface errors `which`, None for none."""
+        heights = self.heights if number is None else self.heights + self.surface(number, which)
+        return [self._image(self._rays(errors, heights, half)) for half in (0, 1)]
+
     def nominal(self) -> TrialFigures:
-        """Figures without errors; with NOMINAL times as many rays for ray images."""
-        if self.waves is not None:
-            return self.evaluate({})
+        """Figures without errors, with NOMINAL times as many rays."""
         pairs = [[self._image(self._rays(Misalignment(), self.heights, 2 * k + half)) for k in range(NOMINAL)] for half in (0, 1)]
         return self.figures_of(np.mean(pairs[0], 0), np.mean(pairs[1], 0))
 
-    def by_waves(self, values: Values, number: int | None) -> tuple[TrialFigures, TrialFigures]:
-        """Figures under the errors of `values` that are of index, thickness, throw and source (WAVED).
+    def check(self, values: Values, number: int) -> tuple[float, float] | None:
+        """Relative RMS of a draw, by its image as obtained here and by its exact one, with the errors that this can include; None
+        where both are the same."""
+        return None
 
-        By the warped nominal wave image, and by the wave image with these errors.
-        """
-        assert self.waves is not None
-        kept = {key: v for key, v in values.items() if key[0] in WAVED}
-        errors, which = Misalignment.of(kept), self.tolerances.surface if number is not None else ()
-        scene = errors.scene(self.scene)
-        scene = replace(scene, screen=replace(scene.screen, z=scene.screen.z + errors.throw))
-        surface = self.surface(number % REALISED, which) if which and number is not None else 0.0
-        own = self._coloured(self.waves(scene, self.field, self.heights + errors.thickness + surface))
-        return self.evaluate(kept, number), self.figures_of(own, own)
-
-    def _coloured(self, image: np.ndarray) -> np.ndarray:
-        return image if image.ndim == 3 else image[None]
-
-    def _wave_image(self, number: int, which: tuple[str, ...]) -> list[np.ndarray]:
-        """Cubic spline coefficients of the wave image of a realisation of the surface errors, per colour."""
-        assert self.waves is not None
-        if (number, which) not in self.smooth:
-            heights = self.heights + self.surface(number, which) if which else self.heights
-            found = self._coloured(self.waves(self.scene, self.field, heights))
-            self.smooth[number, which] = [spline_filter(c, order=3) for c in found]
-        return self.smooth[number, which]
+    def noise(self, one: np.ndarray, other: np.ndarray, target: np.ndarray, error: float) -> float:
+        """Standard error of the error of an image (n_x, n_y), from two halves of it."""
+        return standard_error(one, other, target, error)
 
     def figures_of(self, one: np.ndarray, other: np.ndarray) -> TrialFigures:
         """Figures of an image, from two halves of it."""
@@ -204,8 +167,7 @@ class Trials:
             squares.append(float(np.mean((a - t) * (b - t))))
             level, shift = best_shift(0.5 * (a + b), t)
             best.append((float(np.mean(a * b) + np.mean(t * t)) - 2.0 * level, shift))
-            if self.waves is None:
-                noise += standard_error(one[k], other[k], self.target[k], math.sqrt(max(0.0, squares[-1]))) / len(lit)
+            noise += self.noise(one[k], other[k], self.target[k], math.sqrt(max(0.0, squares[-1]))) / len(lit)
         shift = tuple(float(np.mean([s[axis] for _, s in best]) * self.scene.screen.pixel[axis]) for axis in (0, 1))
         error, shifted = (float(np.mean(np.sqrt(np.maximum(0.0, s)))) for s in (squares, [s for s, _ in best]))
         return TrialFigures(
@@ -234,37 +196,6 @@ class Trials:
         """Landing points relative to the axis, as a splat takes them, mm."""
         sx, sy = self.scene.screen.shift
         return part.x + sx, part.y + sy
-
-    def _moved(self, now: list[LandingPoints], smooth: list[np.ndarray]) -> np.ndarray:
-        """A wave image, given by splines, warped by the displacement of the rays, and brighter or darker as they are."""
-        shape, (wx, wy), (rx, ry) = self.target.shape[1:], self.scene.screen.pixel, self.scene.screen.half_size
-        out = np.zeros(self.target.shape)
-        grid = np.meshgrid(*(np.arange(n, dtype=float) for n in shape), indexing="ij")
-        for channel in range(len(out)):
-            pairs = [(a, b) for a, b in zip(self.begin, now, strict=True) if (a.channel or 0) == channel]
-            if not pairs:
-                continue
-            sums = np.zeros((5, *shape))
-            for a, b in pairs:
-                weight = torch.where(b.power > 0, a.power, 0.0)
-                i, j = ((a.x + rx) / wx).floor().long(), ((a.y + ry) / wy).floor().long()
-                inside = (i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1]) & (a.power > 0)
-                cell, w = (i * shape[1] + j)[inside], weight[inside]
-                # rays that miss the screen now have a place of their own, which may be anywhere: they have no displacement
-                aside = [torch.where(w > 0, w * ((q - p) / width)[inside], 0.0) for p, q, width in ((a.x, b.x, wx), (a.y, b.y, wy))]
-                for k, value in enumerate((w, *aside, a.power[inside], b.power[inside])):
-                    sums[k] += torch.bincount(cell, value, minlength=shape[0] * shape[1]).numpy().reshape(shape)
-            ux, uy = smoothed_ratios(sums[0], sums[1:3], self.near)
-            (gain,) = smoothed_ratios(sums[3], sums[4:], self.near, 1.0)
-            qx, qy = grid
-            for _ in range(BACK):  # q + u(q) = p
-                at = [qx, qy]
-                qx, qy = (p - map_coordinates(u, at, order=1, mode="nearest") for p, u in zip(grid, (ux, uy), strict=True))
-            (xx, xy), (yx, yy) = np.gradient(qx), np.gradient(qy)
-            found = map_coordinates(smooth[channel], [qx, qy], order=3, mode="constant", prefilter=False)
-            gain = map_coordinates(gain, [qx, qy], order=1, mode="nearest")
-            out[channel] = gain * np.maximum(found, 0.0) * np.abs(xx * yy - xy * yx)
-        return out
 
     def _gain(self) -> tuple[float, float]:
         """RMS displacement on the screen along x and y per unit slope of the exit, mm, weighted by power."""
@@ -312,21 +243,6 @@ def best_shift(image: np.ndarray, target: np.ndarray) -> tuple[float, tuple[floa
         level += -0.125 * (ends[0] - ends[1]) ** 2 / bend if bend < 0 else 0.0
         shift.append((at[axis] if at[axis] < n // 2 else at[axis] - n) + part)
     return level, (shift[0], shift[1])
-
-
-def smoothed_ratios(power: np.ndarray, sums: np.ndarray, near: float, without: float = 0.0) -> np.ndarray:
-    """Means (k, n_x, n_y) on every pixel of quantities of its rays, from the sums of their power (n_x, n_y) and of power times
-    quantity (k, n_x, n_y).
-
-    Gaussian average over `near` pixels; where there is too little light, the value of the nearest pixel with enough, or `without`
-    where there is none.
-    """
-    weight = gaussian_filter(power, near, mode="constant")
-    enough = weight > LIT * power.mean()
-    if not enough.any():
-        return np.full_like(sums, without)
-    at = tuple(distance_transform_edt(~enough, return_distances=False, return_indices=True))
-    return np.stack([gaussian_filter(s, near, mode="constant")[at] / weight[at] for s in sums])
 
 
 @dataclass(frozen=True)
@@ -382,7 +298,7 @@ class Study:
     """Result of a tolerance analysis.
 
     drawn, judged: parameters (draws, k) and figures of every draw; nominal: figures without errors; unused: errors that do not
-    apply to the scene, and why; by_waves: whether wave images were used; checked: relative RMS of the draw at 95 %, with only the
+    apply to the scene, and why; by: the images, of rays or waves; checked: relative RMS of the draw at 95 %, with only the
     errors WAVED, by the warped and by its own wave image.
     """
 
@@ -392,7 +308,7 @@ class Study:
     nominal: TrialFigures
     sensitivities: tuple[Sensitivity, ...]
     unused: dict[str, str]
-    by_waves: bool
+    by: str
     seed: int
     checked: tuple[float, float] | None = None
 
@@ -419,13 +335,9 @@ def study(trials: Trials, progress: Callable[[str, int, int], None] = lambda wha
         values = {(p.error, p.axis): float(v) for p, v in zip(trials.parameters, row, strict=True)}
         judged.append(trials.evaluate(values, number))
         progress("draws", number + 1, t.draws)
-    checked = None
-    if trials.waves is not None:
-        at = int(np.argsort([j.relative_rms for j in judged])[math.ceil(0.95 * len(judged)) - 1])
-        values = {(p.error, p.axis): float(v) for p, v in zip(trials.parameters, drawn[at], strict=True)}
-        quick, own = trials.by_waves(values, at)
-        checked = quick.relative_rms, own.relative_rms
-    return Study(trials.parameters, drawn, tuple(judged), nominal, tuple(alone), unused, trials.waves is not None, t.seed, checked)
+    at = int(np.argsort([j.relative_rms for j in judged])[math.ceil(0.95 * len(judged)) - 1])
+    checked = trials.check({(p.error, p.axis): float(v) for p, v in zip(trials.parameters, drawn[at], strict=True)}, at)
+    return Study(trials.parameters, drawn, tuple(judged), nominal, tuple(alone), unused, trials.by, t.seed, checked)
 
 
 def percentile_error(values: np.ndarray, part: float) -> float:
@@ -467,13 +379,12 @@ def figures(found: Study) -> dict:
         "mean_square_root": float(np.sqrt(np.mean(error**2))),
         "p95_standard_error": percentile_error(error, 0.95),
     }
-    by = "waves" if found.by_waves else "rays"
     return {
         "draws": len(found.judged),
         "seed": found.seed,
         "error": spread_of_error,
-        "error_by": by,
-        "judged_by": by,
+        "error_by": found.by,
+        "judged_by": found.by,
         "nominal": {
             "error": found.nominal.relative_rms,
             "relative_rms": found.nominal.relative_rms,

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.errors import CausticError, InputError
+from caustic_cli.errors import CausticError
 from caustic_cli.io.files import SOFTWARE, atomic_file
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import AxisSegment
@@ -53,20 +53,17 @@ LIGHT, LEAK = 4.0, 5e-5
 TIE = 1e-2
 
 
-def require_mitsuba(scene: Scene) -> None:
-    """Refuse a scene that cannot be verified, before work begins.
-
-    Raises:
-        InputError: Mitsuba is not installed, the scene cannot be exported to it, or Fresnel reflection is not exact.
-    """
+def unsupported(scene: Scene) -> str | None:
+    """Why a scene cannot be verified, None if it can: Mitsuba is not installed, or it does not trace such scenes."""
     if find_spec("mitsuba") is None:
-        raise InputError("⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install mitsuba")
+        return "⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install mitsuba"
     if special_features(scene):
-        raise InputError(f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(special_features(scene))}")
+        return f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(special_features(scene))}"
     if scene.source.kind not in KINDS:
-        raise InputError(f"⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}")
+        return f"⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}"
     if scene.lens.fresnel != "exact":
-        raise InputError(f"⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}")
+        return f"⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}"
+    return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from caustic_cli.kinds import problem_of
 from caustic_cli.kinds.surface import NETWORK_CONTROL
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Lens, Scene
 
 #: A comparison without a project: pixels across the screen, and control points, 64 spans and the degree.
 PIXELS, CONTROL = 96, 67
@@ -173,16 +173,7 @@ def variants(
     options = replace(options, dtype=dtype or options.dtype, seed=options.seed if seed is None else seed)
     last = replace(last, rendering=replace(last.rendering, blur=0.0), iterations=ENDLESS, tolerance=0.0, source=None)
     lens = scene.lens
-    nets = (
-        [lens.control]
-        if lens.knots is not None
-        else list(
-            dict.fromkeys(
-                tuple(max(p + 1, math.ceil((n - p) / part) + p) for n, p in zip(lens.control, lens.degree, strict=True))
-                for part in PARTS
-            )
-        )
-    )
+    nets = _nets(lens)
     newton = replace(options, optimizer="lbfgs", parametrisation=Parametrisation())
     found = [(f"lbfgs, {_net(net)}", [replace(last, control=net)], newton) for net in nets]
     if len(nets) > 1:
@@ -216,6 +207,15 @@ def _rendering(stage: Stage, last: Stage, options: Options) -> Rendering:
 def _by_adam(options: Options, network: str) -> Options:
     architecture = options.parametrisation.architecture
     return replace(options, optimizer="adam", parametrisation=Parametrisation(network, "zero", "none", architecture))
+
+
+def _nets(lens: Lens) -> list[tuple[int, int]]:
+    """The control net of a lens and, unless it has knots of its own, those of PARTS of its knot spans."""
+    if lens.knots is not None:
+        return [lens.control]
+    axes = list(zip(lens.control, lens.degree, strict=True))
+    nets = ([max(p + 1, math.ceil((n - p) / part) + p) for n, p in axes] for part in PARTS)
+    return list(dict.fromkeys((nx, ny) for nx, ny in nets))
 
 
 def _net(control: tuple[int, int]) -> str:

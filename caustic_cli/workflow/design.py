@@ -21,7 +21,7 @@ import torch
 
 from caustic_cli import __version__
 from caustic_cli.config import settings
-from caustic_cli.config.completion import PLATE, WALL, complete, shape_words
+from caustic_cli.config.completion import complete, shape_words
 from caustic_cli.config.settings import Given
 from caustic_cli.config.table import TABLE, LensSettings
 from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
@@ -35,6 +35,7 @@ from caustic_cli.io.picture import Picture
 from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.kinds import OneSurface, kind_of, problem_of
 from caustic_cli.kinds.evaluation import Evaluated
+from caustic_cli.kinds.surface import PLATE, WALL
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate

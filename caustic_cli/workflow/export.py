@@ -26,7 +26,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.project.uptodate import Outputs
 from caustic_cli.scene import Scene
-from caustic_cli.studies.picture_error import PictureError
+from caustic_cli.studies.picture_error import PictureError, picture_error
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.reporter import Listener, Reporter
 
@@ -60,7 +60,7 @@ class Exporter:
         """The error of the lens' own picture, and of others."""
         plan = compile_plan(self.scene, self.field, self.heights)
         compile_for(plan.scene, "cpu", self.say, plan.requests)
-        return PictureError(plan, self.field, self.heights, self.target, self.waves, self.seed)
+        return picture_error(plan, self.field, self.heights, self.target, self.waves, self.seed)
 
     def write(
         self,
@@ -78,19 +78,9 @@ class Exporter:
         given: samples or tolerance, mm; without these the smallest file of at most `most` bytes that keeps the picture, or else the
         best.  For light of a single wavelength, the refractive index in the file is that at this wavelength.
         """
-        scene = self.scene
-        if len(scene.light.wavelengths) == 1:
-            scene = scene.at(scene.light.wavelengths[0])
-        if scene.lens.entrance is not None and (script or mould or format not in TWO_SIDED):
-            raise InputError(
-                f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both,"
-                " without ⟨script⟩ or ⟨mould⟩"
-            )
-        if scene.elements and (script or format == "zemax"):
-            raise InputError(
-                f"⟨format⟩ {format} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without"
-                " ⟨script⟩"
-            )
+        scene = at_own_wavelength(self.scene)
+        if why := unsupported(scene, format, script, mould):
+            raise InputError(why)
         part = part_of(format, scene, self.field, self.heights, mould, block)
         home = _home(format)
         writer = getattr(home, f"write_{format}")
@@ -179,6 +169,23 @@ class Exporter:
         path = Path(f"lens{FORMATS[format][0]}")
         file = File(_home(format), _arguments(format, part), path if format == "heightmap" else None, part)
         return self.error(file, file.choices(MOST_BYTES)[-1], "error") <= self.picture.largest
+
+
+def at_own_wavelength(scene: Scene) -> Scene:
+    """A scene with the refractive index at its wavelength, if it has a single one."""
+    return scene.at(scene.light.wavelengths[0]) if len(scene.light.wavelengths) == 1 else scene
+
+
+def unsupported(scene: Scene, format: str, script: bool, mould: bool) -> str | None:
+    """Why a format does not hold a scene, or not with a script or as a mould; None if it does."""
+    if scene.lens.entrance is not None and (script or mould or format not in TWO_SIDED):
+        return (
+            f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both,"
+            " without ⟨script⟩ or ⟨mould⟩"
+        )
+    if scene.elements and (script or format == "zemax"):
+        return f"⟨format⟩ {format} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
+    return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,17 +84,3 @@ def form_deviation(cut: CutSurface, field: HeightField, heights: Tensor, apertur
         "cut_slope_rms": float(slopes.square().mean().sqrt()),
         "cut_slope_most": float(slopes.max()),
     }
-
-
-def rows(figures: dict) -> list[tuple[str, str]]:
-    """The figures as rows of a table (name, text), with the error of the design for comparison."""
-    f, nominal = figures["cut"], []
-    if f["nominal_error_by"] is not None:
-        designed = f"of the surface as designed {f['nominal_error']:.4f} by {f['nominal_error_by']}"
-        nominal = [("relative RMS error", f"{figures['error']:.4f} by {figures['error_by']}; {designed}")]
-    return [
-        *nominal,
-        ("left on the surface", f"up to {1e3 * f['cut_left_mm']:.3g} µm, RMS {1e3 * f['cut_rms_mm']:.3g} µm"),
-        ("cut too deep", f"up to {1e3 * f['cut_gouge_mm']:.3g} µm"),
-        ("slopes off by", f"RMS {f['cut_slope_rms']:.3g}, up to {f['cut_slope_most']:.3g}"),
-    ]

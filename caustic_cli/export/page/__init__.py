@@ -68,25 +68,22 @@ TRACED = frozenset(
 EVEN = (0.7548776662466927, 0.5698402909980532)
 
 
-def refuse_untraceable(scene: Scene) -> None:
-    """Refuse before work begins a scene that the page does not support.
-
-    Raises:
-        InputError: the source is a ray file, the screen is curved, or the lens' index or both its sides vary.
-    """
+def unsupported(scene: Scene) -> str | None:
+    """Why the page does not support a scene, None if it does."""
     if scene.screen.curved:
-        raise InputError("⟨html⟩: the page traces light to plane screens, not to curved ones")
+        return "⟨html⟩: the page traces light to plane screens, not to curved ones"
     if scene.lens.gradient is not None:
-        raise InputError("⟨html⟩: the page traces lenses of one index, and this one's varies")
+        return "⟨html⟩: the page traces lenses of one index, and this one's varies"
     if scene.elements:
-        raise InputError("⟨html⟩: the page traces a single lens, and this scene has [[element]] tables")
+        return "⟨html⟩: the page traces a single lens, and this scene has [[element]] tables"
     if scene.two_sided:
-        raise InputError("⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form")
+        return "⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form"
     if any(one.rays is not None for one in scene.source.members):
-        raise InputError(
+        return (
             "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file; ⟨source.type⟩ renders it under"
             " another light"
         )
+    return None
 
 
 def write_page(
@@ -113,9 +110,10 @@ def write_page(
         encoding: of displayed images, srgb or linear.
 
     Raises:
-        InputError: as in `refuse_untraceable`, or the file cannot be written.
+        InputError: the page does not support the scene, see `unsupported`, or the file cannot be written.
     """
-    refuse_untraceable(scene)
+    if why := unsupported(scene):
+        raise InputError(why)
     screen, kind = _coarser(scene.screen), scene.lens.kind
     data = {
         "title": title,

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from caustic_cli import __version__
-from caustic_cli.export.page import TRACED, write_page
+from caustic_cli.export.page import TRACED, unsupported, write_page
 from caustic_cli.export.surface import sample_grid
+from caustic_cli.io.files import destination
 from caustic_cli.optics.plan import Plan
 from caustic_cli.scene import Scene
 from caustic_cli.workflow.lens import Lens
+from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
 #: Sample points along each axis for wall thickness and slopes.
 SAMPLES = 601
@@ -28,28 +31,39 @@ MISSING = {
 }
 
 
-def write(path: str | Path, lens: Lens, plan: Plan, figures: Mapping[str, Any], waves: np.ndarray | None, title: str) -> None:
-    """Write the page.
+@dataclass(eq=False)
+class InteractivePage(Output):
+    """The page at `html`."""
 
-    Args:
-        plan: of the scene of the lens; figures: of its render; waves: its wave image, or None; title: any text.
+    option: ClassVar[str] = "html"
 
-    Raises:
-        InputError: the page does not support the scene, or the file cannot be written.
-    """
-    scene = plan.scene
-    write_page(
-        path,
-        scene,
-        lens.field,
-        lens.heights,
-        lens.target,
-        title=title,
-        rows=[*_lens_rows(lens), *_light_rows(lens.scene), *_figure_rows(figures)],
-        notes=_notes(plan),
-        waves=waves,
-        encoding=lens.encoding,
-    )
+    html: Path
+
+    def __post_init__(self):
+        destination(self.html)
+
+    def paths(self, place: Place) -> tuple[Path, ...]:
+        return (self.html,)
+
+    def unsupported(self, lens: Lens) -> str | None:
+        return unsupported(lens.scene)
+
+    def write(self, rendering: Rendering) -> dict[str, Any]:
+        """Write the page: page, its path."""
+        lens = rendering.lens
+        write_page(
+            self.html,
+            rendering.plan.scene,
+            lens.field,
+            lens.heights,
+            lens.target,
+            title=rendering.place.lens.resolve().stem,
+            rows=[*_lens_rows(lens), *_light_rows(lens.scene), *_figure_rows(rendering.figures)],
+            notes=_notes(rendering.plan),
+            waves=rendering.waves,
+            encoding=lens.encoding,
+        )
+        return {"page": str(self.html)}
 
 
 def _size(values: tuple[float, float], unit: str = " mm") -> str:

@@ -1,0 +1,111 @@
+"""Target illumination by a lenslet array: image of each lenslet, and brightness of its source by non-negative least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from caustic_cli.inverse.lenslets import lenslets
+from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.io.picture import read_picture, write_image
+from caustic_cli.optics.plan import compile_plan
+from caustic_cli.studies.brightness import brightness
+from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.studies.retrace import retrace, white_level
+from caustic_cli.workflow.lens import Lens
+from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
+
+
+@dataclass(eq=False)
+class Illumination(Output):
+    """The brightness of the source of each lenslet that gives the illumination `want`."""
+
+    option: ClassVar[str] = "want"
+    files: ClassVar[tuple[str, ...]] = ("wanted.png",)
+    beyond: ClassVar[bool] = True
+
+    want: Path
+    #: The target illumination on the pixels of the screen (n_x, n_y), placed like the picture of the project.
+    target: np.ndarray = field(default_factory=lambda: np.empty((0, 0)), init=False)
+
+    @property
+    def asks(self) -> dict[str, object]:
+        return {"want": fingerprint(self.want)}
+
+    def unsupported(self, lens: Lens) -> str | None:
+        if lens.project is None or not lens.scene.lens.arrayed:
+            return "⟨want⟩ is for a project whose lens is an array of lenslets (caustic design with ⟨+lens.array⟩)"
+        if lens.scene.colored:
+            return "⟨want⟩ is of brightness alone, and the project's picture has colours"
+        return None
+
+    def prepare(self, rendering: Rendering) -> None:
+        assert rendering.place.project is not None
+        goal = rendering.place.project.settings.target
+        light = read_picture(self.want, goal.encoding == "linear")
+        self.target = target_on_screen(light.irradiance(), goal.size, rendering.scene.screen, goal.flip)
+
+    def write(self, rendering: Rendering) -> dict[str, Any]:
+        """Solve for the brightnesses and write the resulting image.
+
+        Returns:
+            want: `brightness`, N lists of M, in parts of the largest; `error`, relative RMS of the image, both scaled to the same
+            power; `kkt_residual`, see `studies.brightness`; `power`, the fraction of the source's that they take, if the largest
+            is one; `image`.
+        """
+        (path,) = self.paths(rendering.place)
+        shares, images = zip(*_images(rendering), strict=True)
+        basis = np.stack([i.ravel() for i in images], -1)
+        on_screen = self.target * (basis.sum() / self.target.sum())
+        solved = brightness(basis, on_screen.ravel())
+        level = solved.brightness / solved.brightness.max()
+        seen = (basis @ level).reshape(self.target.shape)
+        write_image(path, seen, white_level(seen, self.target), rendering.lens.encoding)
+        found = {
+            "brightness": level.reshape(rendering.scene.lens.array).tolist(),
+            "error": relative_rms(seen, self.target),
+            "kkt_residual": solved.residual,
+            "power": float(np.dot(level, shares)),
+            "image": str(path),
+        }
+        return {"want": found}
+
+    def show(self, figures: dict[str, Any], say: Any) -> None:
+        f = figures["want"]
+        level = np.array(f["brightness"]).T[::-1]
+        lines = [("brightness" if k == 0 else "", "  ".join(f"{b:.4f}" for b in line)) for k, line in enumerate(level)]
+        rows = [
+            *lines,
+            ("relative RMS error", f"{f['error']:.4f}"),
+            ("KKT residual", f"{f['kkt_residual']:.1e}"),
+            ("power", f"{f['power']:.1%} of all sources at the largest brightness"),
+            ("image", f["image"]),
+        ]
+        say.table("brightness of the lenslets' sources", rows)
+
+
+def _images(rendering: Rendering) -> Iterator[tuple[float, np.ndarray]]:
+    """Of each lenslet, its share of the light and the image of this light (n_x, n_y)."""
+    lens, device = rendering.lens, rendering.device
+    parts = lenslets(rendering.plan.scene, lens.field.shape)
+    with rendering.say.progress(len(parts)) as show:
+        for k, one in enumerate(parts):
+            show("lenslets", f"{k + 1} of {len(parts)}", k, len(parts))
+            heights = one.of(lens.heights)
+            alone = compile_plan(one.scene, one.field, heights)
+            found, _ = retrace(
+                alone.scene,
+                one.field,
+                heights.to(device),
+                None,
+                rays=max(1, rendering.count // len(parts)),
+                seed=rendering.seed,
+                device=device,
+                requests=alone.requests,
+                noise=False,
+            )
+            yield one.share, one.share * found.image.cpu().numpy()
