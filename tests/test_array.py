@@ -20,7 +20,7 @@ from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.step import write_step
 from caustic_cli.inverse.lenslets import array_objective, assemble, initial_array, lenslets
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.target import tiles
 from caustic_cli.optics.bspline import SplineSpace, open_knots
 from caustic_cli.optics.emission import rays_of
@@ -124,7 +124,7 @@ def test_gradient_of_the_loss_of_an_array():
 
     def one(k, part):
         rays = rays_of(part.scene, "grid", 900)
-        return Objective(part.scene, part.field, rays, torch.from_numpy(goals[k]), "rms", Rendering(filter), dtype=torch.float64)
+        return Objective(part.scene, part.field, rays, torch.from_numpy(goals[k]), "rms", LossImage(filter), dtype=torch.float64)
 
     loss = array_objective(lenslets(scene), one)
     shared = torch.zeros_like(heights)

@@ -19,7 +19,7 @@ import torch
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics import backends
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
@@ -60,7 +60,7 @@ def test_cuda_equals_cpu(sampler, dtype, close):
     for device in ("cpu", "cuda"):
         rays = Sampler(sampler, (200, 150), seed=3, device=device)
         images.append(expose(scene, field, heights, rays, filter, dtype).image.cpu())
-        gradients.append(Objective(scene, field, rays, target, "rms-light", Rendering(filter), dtype=dtype)(heights).gradient.cpu())
+        gradients.append(Objective(scene, field, rays, target, "rms-light", LossImage(filter), dtype=dtype)(heights).gradient.cpu())
     for cpu, cuda in (images, gradients):
         assert float((cpu - cuda).norm() / cpu.norm()) < close
 
@@ -75,7 +75,7 @@ def test_cuda_repeats_bitwise(sampler):
     rays, target = Sampler(sampler, (2000, 1500), seed=3, device="cuda"), torch.ones(50, 40, dtype=torch.float64)
     filter = Filter("cosine", (3, 3))
     images = [expose(scene, field, heights, rays, filter).image for _ in range(3)]
-    gradients = [Objective(scene, field, rays, target, "rms-light", Rendering(filter))(heights).gradient for _ in range(3)]
+    gradients = [Objective(scene, field, rays, target, "rms-light", LossImage(filter))(heights).gradient for _ in range(3)]
     for first, *others in (images, gradients):
         assert all(torch.equal(first, other) for other in others)
 

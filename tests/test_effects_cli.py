@@ -14,7 +14,7 @@ from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.io.archive import open_archive
 from caustic_cli.io.files import MARK, refuse_foreign
 from caustic_cli.io.picture import read_picture
@@ -215,7 +215,7 @@ def test_the_loss_of_colours_is_their_root_mean_square():
     heights = 3.0 + 0.02 * torch.randn(7, 7, generator=g, dtype=torch.float64)
     target = torch.rand(3, 10, 10, generator=g, dtype=torch.float64)
     target[2] = 0.0
-    how = Rendering(Filter("cosine", (3, 3)), apron=2, oversample=2, filter_target=False)
+    how = LossImage(Filter("cosine", (3, 3)), apron=2, oversample=2, filter_target=False)
     made = Objective(scene, field, rays_of(scene, "lines", 900), target, "rms-light", how, dtype=torch.float64)
     apart = []
     for k, band in enumerate(scene.bands[:2]):

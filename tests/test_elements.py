@@ -22,7 +22,7 @@ from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import first_surface, sphere_net
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.relay import RelayedScreen
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import AxisSegment
@@ -180,7 +180,7 @@ def test_the_loss_has_the_gradients_of_all_surfaces_together():
     target[10:20, 8:24] = 3.0
     rays = rays_of(scene, "grid", 20_000)
     objective = Objective(
-        scene, FIELD, rays, target, "rms-light", Rendering(Filter("cosine", (5, 5)), apron=6, oversample=1), dtype=torch.float64
+        scene, FIELD, rays, target, "rms-light", LossImage(Filter("cosine", (5, 5)), apron=6, oversample=1), dtype=torch.float64
     )
     found, generator = objective(nets), torch.Generator().manual_seed(3)
     assert found.gradient.shape == nets.shape and (found.gradient.abs().amax((1, 2)) > 0).all()

@@ -20,7 +20,7 @@ from caustic_cli.errors import at_most
 from caustic_cli.inverse import source_limits
 from caustic_cli.inverse.deconvolution import _cells, deconvolved, error_bound
 from caustic_cli.inverse.objective import Objective, SourceBlur
-from caustic_cli.inverse.schedule import Rendering, Stage
+from caustic_cli.inverse.schedule import LossImage, Stage
 from caustic_cli.inverse.source_limits import etendue_limit, performance_limits, point_source, regular_rays, source_spread
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.coherent import modes, outermost_modes, vogel_disc
@@ -189,7 +189,7 @@ def test_a_blurred_render_is_added_up_to_pixels_whatever_it_is_cut_into():
     scene = scene_of(Disc((0.0, 0.0, -40.0), (2.2, 2.2)))
     field, heights = HeightField.of(scene.lens), heights_of(scene)
     traced, rays, kernels = regular_rays(
-        scene, source_spread(scene, field, heights), Stage((19, 19), 40_000, "grid", Rendering(oversample=3), spread=True), 0, "cpu"
+        scene, source_spread(scene, field, heights), Stage((19, 19), 40_000, "grid", LossImage(oversample=3), spread=True), 0, "cpu"
     )
     cosine, target = Filter("cosine", (3, 3)), torch.from_numpy(disc_on(32))
     made = Objective(
@@ -198,7 +198,7 @@ def test_a_blurred_render_is_added_up_to_pixels_whatever_it_is_cut_into():
         rays,
         target,
         "rms",
-        Rendering(cosine, filter_target=False, oversample=3),
+        LossImage(cosine, filter_target=False, oversample=3),
         dtype=torch.float64,
         blur=SourceBlur(kernels),
     )
@@ -213,7 +213,7 @@ def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
     monkeypatch.setattr(source_limits, "EXACT", exact)
     scene = scene_of(SOURCES[kind])
     field, heights = HeightField.of(scene.lens), heights_of(scene)
-    stage = Stage((19, 19), 200_000, "grid", Rendering(oversample=4), spread=True)
+    stage = Stage((19, 19), 200_000, "grid", LossImage(oversample=4), spread=True)
     shifts = source_spread(scene, field, heights)
     traced, rays, kernels = regular_rays(scene, shifts, stage, 0, "cpu")
     assert (len(kernels) > 1) == (exact < 1.0)
@@ -224,7 +224,7 @@ def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
         rays,
         target,
         "rms",
-        Rendering(Filter("cosine", (3, 3)), filter_target=False, oversample=4),
+        LossImage(Filter("cosine", (3, 3)), filter_target=False, oversample=4),
         dtype=torch.float64,
         blur=SourceBlur(kernels),
     )

@@ -21,7 +21,7 @@ from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.kinds import surface
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
@@ -220,7 +220,7 @@ def test_the_objective_knows_the_light_on_the_lens(source):
     field = HeightField.of(lens)
     heights = 3.0 + 0.05 * torch.randn(8, 8, dtype=torch.float64)
     target, rays = torch.from_numpy(blob(24)), rays_of(scene, "stratified", 60_000, 5)
-    objective = Objective(scene, field, rays, target, "light", Rendering(Filter("cosine", (3, 3)), apron=3), dtype=torch.float64)
+    objective = Objective(scene, field, rays, target, "light", LossImage(Filter("cosine", (3, 3)), apron=3), dtype=torch.float64)
     seen = objective(heights)
     image = expose(scene, field, heights, rays, Filter("cosine", (3, 3)), screen=scene.screen.grown((3, 3)))
     fade = np.minimum.outer(*(2 * [np.clip(np.minimum(np.arange(1, 31), np.arange(30, 0, -1)) - 1, 0, 3) / 3.0]))

@@ -13,7 +13,7 @@ from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.penalties import Penalty
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -47,7 +47,7 @@ def disc() -> torch.Tensor:
 
 def objective(loss: str = "rms-light", *, scene: Scene = SCENE, f: Filter = COSINE, target=None, dtype=torch.float64, **how):
     sampler = Sampler("lines", (40, 36), 1)
-    return Objective(scene, FIELD, sampler, disc() if target is None else target, loss, Rendering(f, **how), dtype=dtype)
+    return Objective(scene, FIELD, sampler, disc() if target is None else target, loss, LossImage(f, **how), dtype=dtype)
 
 
 @pytest.mark.parametrize("name", ["rms", "rms-light"])
@@ -202,7 +202,7 @@ def test_three_wavelengths_keep_their_graphs(kind, fresnel, kernels):
     sampler, z, towards = Sampler(kind, (40, 36), 1), heights(), torch.randn(12, 9, dtype=torch.float64)
     assert [band.weight for band in scene.bands] == pytest.approx([0.25, 0.5, 0.25])
     assert len({band.scene.lens.index for band in scene.bands}) == 3
-    made = Objective(scene, FIELD, sampler, disc(), "rms-light", Rendering(COSINE), dtype=torch.float64)
+    made = Objective(scene, FIELD, sampler, disc(), "rms-light", LossImage(COSINE), dtype=torch.float64)
     assert made.whole == (kernels == "fused") and len(made.kept) == 3
 
     class Linear(torch.nn.Module):
@@ -214,7 +214,7 @@ def test_three_wavelengths_keep_their_graphs(kind, fresnel, kernels):
             return (image * towards).sum() + 3.0 * leaving + penalty
 
     def gradient(of: Scene) -> torch.Tensor:
-        one = Objective(of, FIELD, sampler, disc(), "rms-light", Rendering(COSINE), dtype=torch.float64)
+        one = Objective(of, FIELD, sampler, disc(), "rms-light", LossImage(COSINE), dtype=torch.float64)
         assert one.whole
         one.loss = Linear()
         return one(z).gradient
@@ -261,7 +261,7 @@ def test_penalties_have_the_slope_of_differences(loss, max_slope, chunks, monkey
         sampler,
         target,
         loss,
-        Rendering(Filter("cosine", (5, 5)), apron=3),
+        LossImage(Filter("cosine", (5, 5)), apron=3),
         limits=Limits(max_slope=max_slope),
         dtype=torch.float64,
     )
@@ -270,7 +270,7 @@ def test_penalties_have_the_slope_of_differences(loss, max_slope, chunks, monkey
     e = function(heights)
     assert float((e.gradient * along).sum()) == pytest.approx(difference, rel=1e-5)
     plain = Objective(
-        scene, field, sampler, target, loss.split(" ")[0], Rendering(Filter("cosine", (5, 5)), apron=3), dtype=torch.float64
+        scene, field, sampler, target, loss.split(" ")[0], LossImage(Filter("cosine", (5, 5)), apron=3), dtype=torch.float64
     )
     assert e.loss > plain(heights).loss
 
@@ -304,7 +304,7 @@ def test_oversampling_adds_up_smaller_pixels(chunks, monkeypatch):
         sampler,
         target,
         "rms-light",
-        Rendering(Filter("cosine", (3, 3)), apron=2, oversample=3, filter_target=False),
+        LossImage(Filter("cosine", (3, 3)), apron=2, oversample=3, filter_target=False),
         dtype=torch.float64,
     )
     fine = replace(scene.screen.grown((2, 2)), resolution=(66, 57))

@@ -9,7 +9,7 @@ import torch
 from torch.autograd import forward_ad
 
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.rays import LOSSES
 from caustic_cli.optics.reconstruction import Filter
@@ -44,7 +44,7 @@ def parts(scene, field, heights, rays, filter, dtype, monkeypatch):
     out = []
     for kernels in ("torch", ""):
         monkeypatch.setenv("CAUSTIC_KERNELS", kernels)
-        objective = Objective(scene, field, rays, target, "rms-light", Rendering(filter), dtype=dtype)
+        objective = Objective(scene, field, rays, target, "rms-light", LossImage(filter), dtype=dtype)
         out.append((expose(scene, field, heights, rays, filter, dtype), objective(heights)))
     return out
 
@@ -138,7 +138,7 @@ def test_chunks_add_up():
     many = expose(scene, field, heights, rays, Filter("cosine", (3, 3)), chunk=333)
     assert float((one.image - many.image).abs().max() / one.image.max()) < 1e-13
     target = torch.rand(SCREEN.resolution, dtype=torch.float64)
-    objective = Objective(scene, field, rays, target, "rms", Rendering(Filter("cosine", (3, 3))), dtype=torch.float64)
+    objective = Objective(scene, field, rays, target, "rms", LossImage(Filter("cosine", (3, 3))), dtype=torch.float64)
     whole = objective(heights)
     objective.kept = [(0, Tracer(System.of(scene, field), b)) for b in rays.chunks(700)]
     assert len(objective.kept) > 5

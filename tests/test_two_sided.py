@@ -14,7 +14,7 @@ from caustic_cli import cli, load
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.initial_two_sided import first_sides
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.io.archive import open_archive
@@ -76,7 +76,7 @@ def test_a_loss_of_zero_has_no_gradient():
 
     def evaluation(target: torch.Tensor):
         rays = rays_of(scene, "grid", 10_000)
-        return TwoSidedObjective(scene, field, rays, (target,), "rms", Rendering(Filter("cosine", (3, 3)), filter_target=False))(
+        return TwoSidedObjective(scene, field, rays, (target,), "rms", LossImage(Filter("cosine", (3, 3)), filter_target=False))(
             plate
         )
 
@@ -90,7 +90,7 @@ def test_losses_of_the_images_alone_have_gradients_of_both_sides(loss):
     scene = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget(FAR))
     field, targets = HeightField.of(LENS), (torch.from_numpy(ONE), torch.from_numpy(TWO))
     objective = TwoSidedObjective(
-        scene, field, rays_of(scene, "grid", 10_000), targets, loss, Rendering(Filter("cosine", (5, 5)), apron=6)
+        scene, field, rays_of(scene, "grid", 10_000), targets, loss, LossImage(Filter("cosine", (5, 5)), apron=6)
     )
     nets = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, 15.0, dtype=torch.float64)])
     assert bool(torch.isfinite(objective(nets).gradient).all())
@@ -115,7 +115,7 @@ def test_the_loss_has_the_gradients_of_both_sides(second):
         rays_of(scene, "grid", 40_000),
         tuple(targets),
         "rms-light + 0.01 laplacian",
-        Rendering(Filter("cosine", (5, 5)), apron=6),
+        LossImage(Filter("cosine", (5, 5)), apron=6),
         limits=Limits(max_slope=0.3),
         dtype=torch.float64,
     )

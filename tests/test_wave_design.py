@@ -20,7 +20,7 @@ from caustic_cli.config import completion
 from caustic_cli.config.default_stages import LEAST_WAVES, WAVES, wave_refinement
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.constraints import Limits
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_magnification, white
 from caustic_cli.optics.surfaces import HeightField
@@ -77,7 +77,7 @@ def design(capfd, *arguments, code=0) -> dict | str:
 
 
 @pytest.mark.parametrize("source", [None, Points(((0.1, 0.0, -80.0),)), Disc(angle=0.1)], ids=["plane", "point", "disc"])
-@pytest.mark.parametrize("how", [(), (Rendering(blur=1.0, apron=2), Limits(max_slope=0.01))], ids=["plain", "limits"])
+@pytest.mark.parametrize("how", [(), (LossImage(blur=1.0, apron=2), Limits(max_slope=0.01))], ids=["plain", "limits"])
 def test_gradient_of_the_loss(source, how):
     """As central differences say, in float64; a unit of wavelengths at a time or all kept."""
     scene = scene_of(source)

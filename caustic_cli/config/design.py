@@ -14,7 +14,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.parametrisation import Architecture, Parametrisation
 from caustic_cli.inverse.problem import Options
-from caustic_cli.inverse.schedule import Rendering, Stage
+from caustic_cli.inverse.schedule import LossImage, Stage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
 
@@ -64,7 +64,7 @@ def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
         t.control,
         t.rays,
         t.sampler,
-        Rendering(filter, t.blur, t.apron, t.oversample, settings.design.filter_target),
+        LossImage(filter, t.blur, t.apron, t.oversample, settings.design.filter_target),
         t.iterations,
         t.tolerance,
         None if t.source is None else build_source(settings.source, type=t.source),

@@ -31,7 +31,7 @@ from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Evaluation, Objective
 from caustic_cli.inverse.parametrisation import FreeHeights
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.surface_from_map import integrate
 from caustic_cli.inverse.transport import corners, solve
 from caustic_cli.optics.emission import rays_of
@@ -194,7 +194,7 @@ class _IndexObjective(Objective):
             sampler,
             torch.from_numpy(np.ascontiguousarray(target, dtype=np.float64)),
             "rms-light",
-            Rendering(apron=apron, oversample=OVERSAMPLE),
+            LossImage(apron=apron, oversample=OVERSAMPLE),
             dtype=torch.float64,
         )
 

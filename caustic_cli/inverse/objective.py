@@ -27,7 +27,7 @@ from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.loss_terms import PENALTIES, parse
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.penalties import Penalty
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.memory import smaller_chunk
 from caustic_cli.optics.sampling import Sampler
@@ -122,10 +122,10 @@ class Channel:
 
     Args:
         screen: of the picture; target: (n_x, n_y) irradiance there, or (3, n_x, n_y) in colour.
-        loss: weighted terms, see `losses.parse`; how: see `Rendering`; blur: of the source.
+        loss: weighted terms, see `losses.parse`; how: see `LossImage`; blur: of the source.
     """
 
-    def __init__(self, screen: Screen, target: Tensor, loss: str, how: Rendering, blur: SourceBlur = UNBLURRED):
+    def __init__(self, screen: Screen, target: Tensor, loss: str, how: LossImage, blur: SourceBlur = UNBLURRED):
         self.how, self.cut = how, blur.cut
         grown = screen.grown((how.apron + blur.beside[0], how.apron + blur.beside[1]))
         nx, ny = grown.resolution
@@ -166,7 +166,7 @@ class Objective:
         sampler: the rays, the same at every evaluation; or a list with those of several points of the source.
         target: (n_x, n_y) irradiance on the scene's screen, or (3, n_x, n_y) of a coloured scene.
         loss: weighted terms, see `losses.parse`.
-        how: render and comparison, see `Rendering`.
+        how: render and comparison, see `LossImage`.
         limits: of the surface, enforced by penalties.
         blur: of the source, where `sampler` has the rays of its points.
         dtype: precision of the rays.
@@ -184,7 +184,7 @@ class Objective:
         sampler: Rays | Sequence[Rays],
         target: Tensor,
         loss: str,
-        how: Rendering | None = None,
+        how: LossImage | None = None,
         limits: Limits | None = None,
         *,
         blur: SourceBlur = UNBLURRED,
@@ -192,7 +192,7 @@ class Objective:
     ):
         self.samplers = list(sampler) if isinstance(sampler, Sequence) else [sampler]
         self.device = self.samplers[0].device
-        self.channels = [Channel(scene.screen, target.to(self.device), loss, how or Rendering(), blur)]
+        self.channels = [Channel(scene.screen, target.to(self.device), loss, how or LossImage(), blur)]
         self.loss = self.channels[0].loss
         self.penalty = penalty_of(scene, field, loss, limits or Limits(), self.device)
         self.scene, self.field, self.dtype, self.blur = scene, field, dtype, blur

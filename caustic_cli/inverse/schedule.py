@@ -19,7 +19,7 @@ RAYS_A_WAVE = 600_000
 
 
 @dataclass(frozen=True)
-class Rendering:
+class LossImage:
     """How the image inside a loss is rendered, and compared with its target."""
 
     #: Reconstruction filter.
@@ -49,7 +49,7 @@ class Stage:
     #: See `caustic_cli.optics.sampling`.
     sampler: str = "lines"
     #: The render inside the loss, and its comparison with the target.
-    rendering: Rendering = field(default_factory=Rendering)
+    rendering: LossImage = field(default_factory=LossImage)
     #: Optimiser iterations; the last stage continues to the total of the design.
     iterations: int = 30
     #: Ends the stage when ten iterations lowered the loss by less than this part; 0 never.

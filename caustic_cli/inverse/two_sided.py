@@ -13,7 +13,7 @@ from typing import Any
 from torch import Tensor
 
 from caustic_cli.inverse.objective import Channel, Objective
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.angular_error import squared_angular_error
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -43,13 +43,13 @@ class TwoSidedObjective(Objective):
         sampler: Rays,
         targets: tuple[Tensor, ...],
         loss: str,
-        how: Rendering | None = None,
+        how: LossImage | None = None,
         **options: Any,
     ):
         assert scene.second is not None
         super().__init__(scene, field, sampler, targets[0], loss, how, **options)
         if scene.second.screen is not None:
-            self.channels.append(Channel(scene.second.screen, targets[1].to(self.device), loss, how or Rendering()))
+            self.channels.append(Channel(scene.second.screen, targets[1].to(self.device), loss, how or LossImage()))
         self.further = 2 - len(self.channels)
 
     def _see(self, traced: Tracer, parameters: Parameters) -> list[Tensor]:

@@ -22,7 +22,7 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.objective import Evaluation, penalty_of
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves.image import Imager, Line, lines_of
@@ -76,14 +76,14 @@ class WaveObjective:
         heights: Tensor,
         target: Tensor,
         loss: str,
-        how: Rendering | None = None,
+        how: LossImage | None = None,
         limits: Limits | None = None,
         *,
         wavelengths: tuple[float, ...] = (),
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ):
-        how = how or Rendering()
+        how = how or LossImage()
         self.scene, self.field, self.apron, self.dtype = scene, field, how.apron, dtype
         self.middle = heights.detach().double().to(device)
         screen = scene.screen.grown((how.apron, how.apron))

@@ -52,7 +52,7 @@ class Seen(NamedTuple):
     figures: dict[str, Any]
 
 
-class Judge:
+class Evaluator:
     """Figures of a finished lens, and the lens that is kept; see `OneSurface.evaluate`."""
 
     def __init__(self, designer: Designer, state: State, rays: int, size: tuple[float, float], timed: bool):
@@ -132,7 +132,7 @@ class Judge:
             heights = self.state.heights.to(self.problem.device)
             self.figures |= unseen_figures(self.problem.scene, self.field, heights, self.target)
 
-    def found(self) -> Evaluated:
+    def result(self) -> Evaluated:
         """The result."""
         light = None if self.light is None else self.light.image.cpu().numpy()
         return Evaluated(self.state, judged(self.figures, self.refined), self.exposure.image.cpu().numpy(), light)

@@ -47,7 +47,7 @@ from caustic_cli.inverse.source_limits import (
 from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.kinds.defaults import Defaults
-from caustic_cli.kinds.evaluation import Evaluated, Judge
+from caustic_cli.kinds.evaluation import Evaluated, Evaluator
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
@@ -423,19 +423,19 @@ class OneSurface(Problem):
             size: width and height of the picture, mm; timed: under a time limit, do not increase the number of rays, and limit the
                 iterations for the least error.
         """
-        judge = Judge(designer, state, self.final_rays, size, timed)
+        found = Evaluator(designer, state, self.final_rays, size, timed)
         if self.one_scene:
-            judge.compare_with_start()
-        judge.compare_unrounded()
+            found.compare_with_start()
+        found.compare_unrounded()
         bounds = self.source_limits(SMOOTH_STEPS if timed else None)
-        judge.figures |= {
+        found.figures |= {
             key: bound
             for key, bound in (("least_relative_rms", bounds.error), ("etendue_limit", bounds.etendue))
             if bound is not None
         }
-        judge.add_unseen()
-        judge.figures |= self.further_figures(designer, judge.state)
-        return judge.found()
+        found.add_unseen()
+        found.figures |= self.further_figures(designer, found.state)
+        return found.result()
 
     def errors(self, designer: Designer, state: State, rays: int, seed: int, middle: bool = True) -> list[dict[str, Any]]:
         """Figures of the lens with independent rays, a row for each scene that it is for.

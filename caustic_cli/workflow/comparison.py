@@ -21,7 +21,7 @@ from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.parametrisation import Heights, Parametrisation
 from caustic_cli.inverse.problem import Options, Problem
-from caustic_cli.inverse.schedule import Rendering, Stage
+from caustic_cli.inverse.schedule import LossImage, Stage
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.picture import Picture
 from caustic_cli.kinds import problem_of
@@ -198,7 +198,7 @@ def variants(
     return found
 
 
-def _rendering(stage: Stage, last: Stage, options: Options) -> Rendering:
+def _rendering(stage: Stage, last: Stage, options: Options) -> LossImage:
     """The rendering of a stage with the filter of the last one; the loss rms is defined on the screen only."""
     how = replace(stage.rendering, filter=last.rendering.filter)
     return replace(how, apron=0) if options.loss == "rms" else how

@@ -34,12 +34,12 @@ def iteration(s=None, bare: bool = False):
     s = s or own
     f = Filter(BASE["kind"], (BASE["filter"],) * 2, (BASE["alpha"],) * 2)
     target = torch.rand((250, 250), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    from caustic_cli.inverse.schedule import Rendering  # noqa: PLC0415
+    from caustic_cli.inverse.schedule import LossImage  # noqa: PLC0415
     from caustic_cli.optics.emission import rays_of  # noqa: PLC0415
     from caustic_cli.optics.system import System  # noqa: PLC0415
     from caustic_cli.optics.trace import Tracer  # noqa: PLC0415
 
-    made = Objective(s, field, rays_of(s, "grid", BASE["rays"]), target, "rms-light", Rendering(f))
+    made = Objective(s, field, rays_of(s, "grid", BASE["rays"]), target, "rms-light", LossImage(f))
     if bare:
         (sample,) = Sampler.of_size("grid", BASE["rays"]).chunks()
         made.kept = [Tracer(System.of(s, field), sample, torch.float32)]

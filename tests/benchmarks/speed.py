@@ -24,7 +24,7 @@ from pathlib import Path
 import torch
 
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -54,7 +54,7 @@ def objective(kernels: str, rays: int, control: int, degree: int, pixels: int, f
     f = Filter(kind, (filter, filter), (alpha, alpha)) if filter > 1 else Filter()
     target = torch.rand((pixels, pixels), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     os.environ["CAUSTIC_KERNELS"] = kernels
-    made = Objective(s, field, Sampler.of_size("grid", rays), target, "rms-light", Rendering(f))
+    made = Objective(s, field, Sampler.of_size("grid", rays), target, "rms-light", LossImage(f))
     os.environ["CAUSTIC_KERNELS"] = ""
     return lambda: made(heights)
 

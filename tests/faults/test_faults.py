@@ -15,7 +15,7 @@ from helpers import small_designs, write_blob
 from caustic_cli import cli
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.io import files
 from caustic_cli.optics import memory, trace
 from caustic_cli.optics.reconstruction import Filter
@@ -238,7 +238,7 @@ def scarce(monkeypatch, most: int) -> list:
 def test_fewer_rays_at_a_time_are_tried_when_memory_runs_out(kind, monkeypatch):
     sampler, z = Sampler(kind, (200, 200), 1), 3.0 + 0.1 * torch.randn(7, 6, dtype=torch.float64)
     target = torch.rand(12, 9, dtype=torch.float64)
-    make = lambda: Objective(SCENE, FIELD, sampler, target, "rms", Rendering(Filter("cosine", (3, 3))), dtype=torch.float64)  # noqa: E731
+    make = lambda: Objective(SCENE, FIELD, sampler, target, "rms", LossImage(Filter("cosine", (3, 3))), dtype=torch.float64)  # noqa: E731
     plenty, image = make()(z), trace.expose(SCENE, FIELD, z, sampler).image
     tried = scarce(monkeypatch, 20_000)
     found = make()(z)

@@ -17,7 +17,7 @@ from caustic_cli.inverse.losses import LOSSES, Loss, NoLight
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import Parametrisation
 from caustic_cli.inverse.problem import Options, Problem
-from caustic_cli.inverse.schedule import Rendering, Stage
+from caustic_cli.inverse.schedule import LossImage, Stage
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
@@ -63,7 +63,7 @@ def test_all_rays_lost(why, kernels, dtype, compare):
     text = json.dumps(figures_of_merit(e, TARGET.numpy()), allow_nan=False)
     naive = float(((e.image / e.image.sum() - 1.0 / 144) ** 2).mean())
     compare("all rays lost", "the loss against 1", naive, abs(json.loads(text)["relative_rms"] - 1.0), 1e-12)
-    objective = Objective(s, field, rays, TARGET, "rms-light", Rendering(Filter("cosine", (3, 3))), dtype=dtype)
+    objective = Objective(s, field, rays, TARGET, "rms-light", LossImage(Filter("cosine", (3, 3))), dtype=dtype)
     with pytest.raises(NoLight, match="no light reaches the screen"):
         objective(prism(field, slope))
 
@@ -223,7 +223,7 @@ def test_one_ray(kernels, dtype):
         e = expose(s, field, heights, rays, Filter("cosine", (3, 3)), dtype)
         assert float(e.image.sum()) + sum(e.lost.values()) == pytest.approx(1.0, abs=1e-6)
         if float(e.image.sum()) > 0:
-            found = Objective(s, field, rays, TARGET, "rms-light", Rendering(Filter("cosine", (3, 3))), dtype=dtype)(heights)
+            found = Objective(s, field, rays, TARGET, "rms-light", LossImage(Filter("cosine", (3, 3))), dtype=dtype)(heights)
             assert math.isfinite(found.loss) and bool(torch.isfinite(found.gradient).all())
             checked += 1
     assert checked >= 2

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
@@ -84,7 +84,7 @@ def test_finite_and_energy_closes(kernel, dtype, monkeypatch):
         assert abs(float(e.image.sum()) + math.fsum(e.lost.values()) - 1.0) < CLOSE[dtype]
         target = torch.rand(s.screen.resolution, dtype=torch.float64) + 0.01
         try:
-            value = Objective(s, field, rays, target, "rms-light + throughput", Rendering(filter, apron=1), dtype=dtype)(heights)
+            value = Objective(s, field, rays, target, "rms-light + throughput", LossImage(filter, apron=1), dtype=dtype)(heights)
         except NoLight:
             seen.append(False)
             return

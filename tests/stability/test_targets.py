@@ -14,7 +14,7 @@ from caustic_cli import cli
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import FreeHeights
-from caustic_cli.inverse.schedule import Rendering
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
@@ -52,11 +52,11 @@ def test_loss_and_derivative(name, loss, kernels, dtype, compare):
     s, field = Scene(PlaneWave(), lens, Screen((14.0, 14.0), 60.0, (N, N))), HeightField.of(lens)
     heights = 5.0 + 0.3 * torch.rand(8, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     sampler, filter = Sampler("grid", (60, 60)), Filter("cosine", (3, 3))
-    found = Objective(s, field, sampler, picture, loss, Rendering(filter, apron=2), dtype=dtype)(heights)
+    found = Objective(s, field, sampler, picture, loss, LossImage(filter, apron=2), dtype=dtype)(heights)
     assert math.isfinite(found.loss) and bool(torch.isfinite(found.gradient).all())
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CAUSTIC_KERNELS", "torch")
-        exact = Objective(s, field, sampler, picture, loss, Rendering(filter, apron=2), dtype=torch.float64)(heights)
+        exact = Objective(s, field, sampler, picture, loss, LossImage(filter, apron=2), dtype=torch.float64)(heights)
     if exact.loss == 0.0:  # the evenness of a single pixel
         assert loss == "uniformity" and found.loss == 0.0 and not found.gradient.any()
         return
