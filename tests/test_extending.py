@@ -354,8 +354,8 @@ KIND = Addition(
     edits=(
         (
             "kinds/__init__.py",
-            "from caustic_cli.kinds.two_sides import TwoSides\n",
-            "from caustic_cli.kinds.two_sides import TwoSides\nfrom caustic_cli.kinds.two_throws import TwoThrows\n",
+            "from caustic_cli.kinds.two_sided import TwoSides\n",
+            "from caustic_cli.kinds.two_sided import TwoSides\nfrom caustic_cli.kinds.two_throws import TwoThrows\n",
         ),
         ("kinds/__init__.py", "    RobustSurface,\n", "    RobustSurface,\n    TwoThrows,\n"),
         (

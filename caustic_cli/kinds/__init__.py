@@ -14,7 +14,7 @@ from caustic_cli.kinds.lenslet_array import LensletArray
 from caustic_cli.kinds.network_range import NetworkAmongElements, NetworkOverRange
 from caustic_cli.kinds.robust import RobustArray, RobustSurface
 from caustic_cli.kinds.surface import Described, OneSurface
-from caustic_cli.kinds.two_sides import TwoSides
+from caustic_cli.kinds.two_sided import TwoSides
 
 #: All kinds; a design is of the first that applies.
 KINDS: tuple[type[OneSurface], ...] = (
