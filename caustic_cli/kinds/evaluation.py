@@ -52,7 +52,7 @@ class Seen(NamedTuple):
     figures: dict[str, Any]
 
 
-class Evaluator:
+class LensEvaluation:
     """Figures of a finished lens, and the lens that is kept; see `OneSurface.evaluate`."""
 
     def __init__(self, designer: Designer, state: State, rays: int, size: tuple[float, float], timed: bool):

@@ -47,7 +47,7 @@ from caustic_cli.inverse.source_limits import (
 from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.kinds.defaults import Defaults
-from caustic_cli.kinds.evaluation import Evaluated, Evaluator
+from caustic_cli.kinds.evaluation import Evaluated, LensEvaluation
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
@@ -423,7 +423,7 @@ class OneSurface(Problem):
             size: width and height of the picture, mm; timed: under a time limit, do not increase the number of rays, and limit the
                 iterations for the least error.
         """
-        found = Evaluator(designer, state, self.final_rays, size, timed)
+        found = LensEvaluation(designer, state, self.final_rays, size, timed)
         if self.one_scene:
             found.compare_with_start()
         found.compare_unrounded()
