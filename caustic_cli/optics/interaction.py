@@ -96,12 +96,12 @@ class Interaction:
         """The light that a refracting element reflects, as rays that start at its surface."""
         assert self.power_in is not None and self.out is not None
         hit, element = self.hit, self.element
-        found = self.tracer.backend.interact(
+        reflected = self.tracer.backend.interact(
             hit.incoming, hit.slopes, self.power_in, eta=1.0, reflects=True, fresnel=element.fresnel, side=self.side
         )
         return replace(
             self.state,
-            direction=rotate_to_global(element.pose, found.direction),
+            direction=rotate_to_global(element.pose, reflected.direction),
             power=self.power_in - self.out.power,
             lost={},
             sample=None,

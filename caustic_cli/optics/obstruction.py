@@ -241,11 +241,11 @@ def _stations(scene: Scene) -> tuple[list[Body], ScreenBody]:
         name, depth = f"the {part.kind} of [[element]] {number + 1}", (low - part.z, high - part.z)
         return Body(name, pose.position, pose.axes, part.opening, depth)
 
-    found = [body(k, part) for k, part in enumerate(scene.before)]
+    found = [body(k, part) for k, part in enumerate(scene.in_front)]
     name = "the free-form lens" if scene.elements else f"the {lens.kind}"
     depth = lens.interaction.extent(lens.lowest, lens.offset.thickness)
     found.append(Body(name, (0.0, 0.0, 0.0), IDENTITY, lens.opening.grown(lens.border), depth))
-    for k, part in enumerate(scene.behind, len(scene.before)):
+    for k, part in enumerate(scene.behind, len(scene.in_front)):
         found.append(body(k, part))
         leg = part.axis_behind(leg)
     return found, ScreenBody(scene.screen, leg)

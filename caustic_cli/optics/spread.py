@@ -208,7 +208,7 @@ def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | Non
     system, parameters = System.of(scene, field), {EXIT: heights.detach().double()}
 
     def landing(mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        tracer = Tracer(system, mode.through(u, v, system.before.index_at(None)))
+        tracer = Tracer(system, mode.through(u, v, system.object_space.index_at(None)))
         state, left = tracer.land(parameters, scene.screen)[0].expanded(), tracer.last(parameters).state.expanded()
         return *state.full(state.origin)[:2], state.power, *left.full(left.origin)[:2]
 

@@ -71,7 +71,7 @@ class Light:
         return (len(RGB),) if self.color else ()
 
     @property
-    def parts(self) -> tuple[float, ...]:
+    def fractions(self) -> tuple[float, ...]:
         """Fraction of the power at each wavelength; they sum to 1."""
         weights = self.weights or (1.0,) * len(self.wavelengths)
         return tuple(w / sum(weights) for w in weights)

@@ -154,14 +154,14 @@ class Tolerances:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The random variables with a width above 0."""
-        found = []
+        parameters = []
         for error in self.errors:
             kind = KINDS[error.name]
             for axis, (label, width) in enumerate(zip(kind.axes, error.width, strict=True)):
                 if width > 0:
                     name = f"{error.name} {label}".strip()
-                    found.append(Parameter(name, error.name, axis, kind.unit, error.distribution, width))
-        return tuple(found)
+                    parameters.append(Parameter(name, error.name, axis, kind.unit, error.distribution, width))
+        return tuple(parameters)
 
     @property
     def surface(self) -> tuple[str, ...]:

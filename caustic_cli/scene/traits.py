@@ -19,7 +19,7 @@ class Trait:
     """Something that a scene may have: a noun phrase for messages, and whether a scene has it."""
 
     words: str
-    found_in: Callable[[Scene], bool]
+    is_in: Callable[[Scene], bool]
 
 
 #: All traits by name, in the order in which messages list them.
@@ -38,13 +38,13 @@ TRAITS: Mapping[str, Trait] = {
     "shifted screen": Trait("a shifted screen", lambda s: any(s.screen.shift)),
     "curved screen": Trait("a curved screen", lambda s: s.screen.curved),
     "several sources": Trait("several sources", lambda s: len(s.source.members) > 1),
-    "ray file": Trait("the rays of a file", lambda s: any(one.rays is not None for one in s.source.members)),
+    "ray file": Trait("the rays of a file", lambda s: any(member.rays is not None for member in s.source.members)),
 }
 
 
 def traits_of(scene: Scene) -> Iterator[str]:
     """Names of the traits that a scene has, in their order."""
-    return (name for name, trait in TRAITS.items() if trait.found_in(scene))
+    return (name for name, trait in TRAITS.items() if trait.is_in(scene))
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,11 @@ class Capability:
 
     def why_not(self, scene: Scene) -> str:
         """Why a scene is not supported; "" if it is."""
-        there = [name for name in self.unsupported if TRAITS[name].found_in(scene)]
-        if not there:
+        present = [name for name in self.unsupported if TRAITS[name].is_in(scene)]
+        if not present:
             return ""
-        message = self.unsupported[there[0]]
-        return message.format(", ".join(TRAITS[name].words for name in there if self.unsupported[name] == message))
+        message = self.unsupported[present[0]]
+        return message.format(", ".join(TRAITS[name].words for name in present if self.unsupported[name] == message))
 
     def refuse(self, scene: Scene) -> None:
         """Refuse a scene before work begins.

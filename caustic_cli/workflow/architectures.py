@@ -53,7 +53,7 @@ class NetworkDesign:
         seed: int,
     ):
         self.designers, self.target, self.rays, self.seed = designers, target, rays, seed
-        self.states = [one.begin(*first or ()) for one in designers]
+        self.states = [one.initial_state(*first or ()) for one in designers]
         held = [state.parameters or {"heights": state.heights} for state in self.states]  # free heights are the parameters
         count = sum(v.numel() for parameters in held for name, v in parameters.items() if name != "start")
         self.about = about | {"parameters": count}
@@ -130,7 +130,7 @@ class _Study:
         if self.over is not None and chosen.start != "offset":
             _, self.problem, self.first = first_heights(project, {"lens": dict(project.settings.lens)}, self.problem)
         scene, stages, own = self.problem.scene, [s for s in self.problem.stages if not s.waves], self.problem.options
-        if not stages or scene.second is not None or scene.lens.arrayed:
+        if not stages or scene.second_target is not None or scene.lens.arrayed:
             raise InputError(
                 "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
             )

@@ -81,9 +81,9 @@ class Sphere(Surface[None]):
         t = big_f / (big_g + side * root)
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
         cosine = 1.0 - k * z  # towards the vertex's half; 0 at the equator
-        found = met & (t >= 0) & (cosine > math.sqrt(1.0 - EQUATOR**2)) & (side * (dz * cosine - k * (x * dx + y * dy)) > 0)
+        valid = met & (t >= 0) & (cosine > math.sqrt(1.0 - EQUATOR**2)) & (side * (dz * cosine - k * (x * dx + y * dy)) > 0)
         none, one = torch.zeros_like(t), torch.ones_like(t)
-        cosine = torch.where(found, cosine, one)
+        cosine = torch.where(valid, cosine, one)
         return SurfaceIntersection(
-            torch.where(found, t, none), torch.where(found, k * x / cosine, none), torch.where(found, k * y / cosine, none), found
+            torch.where(valid, t, none), torch.where(valid, k * x / cosine, none), torch.where(valid, k * y / cosine, none), valid
         )

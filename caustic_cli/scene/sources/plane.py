@@ -33,8 +33,8 @@ class PlaneWave(Source):
         if self.profile is not None:
             e = np.asarray(self.profile, dtype=float)
             with np.errstate(over="ignore"):
-                whole = e.sum()
-            if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not 0 < whole < np.inf:
+                total = e.sum()
+            if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not 0 < total < np.inf:
                 raise InputError("⟨source.profile⟩ must be a 2-D picture, finite, not negative, and not black all over")
             object.__setattr__(self, "profile", e)
 

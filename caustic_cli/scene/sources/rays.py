@@ -43,9 +43,9 @@ class Measured(Source):
         """The point of closest approach."""
         return (self.rays.focus + self.position)[None, :], np.ones(1)
 
-    def part(self, k: int, of: int) -> Source:
+    def batch(self, k: int, of: int) -> Source:
         """As of a source: a random partition of the rays."""
-        return replace(self, rays=self.rays.part(k, of))
+        return replace(self, rays=self.rays.batch(k, of))
 
     @property
     def extent(self) -> tuple[float, float]:

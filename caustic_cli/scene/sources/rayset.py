@@ -21,7 +21,7 @@ from caustic_cli.errors import InputError
 FARTHEST = 1e9
 #: Largest distance of the point of closest approach from the rays' starting points, mm: parallel rays have none.
 PARALLEL_AT = 1e6
-#: Least number of rays in a part: with fewer, a part may have none that reaches the lens.
+#: Least number of rays in a batch: with fewer, a batch may have none that reaches the lens.
 LEAST_SHARED = 50
 #: Range of valid wavelengths, nm.
 SHORTEST, LONGEST = 100.0, 20_000.0
@@ -94,8 +94,8 @@ class RaySet:
             found.update(b"" if values is None else np.ascontiguousarray(values, "<f8").tobytes())
         return found.hexdigest()
 
-    def part(self, k: int, of: int) -> RaySet:
-        """The k-th part of a fixed random partition of the rays into `of` sets; all rays where there are too few."""
+    def batch(self, k: int, of: int) -> RaySet:
+        """The k-th batch of a fixed random partition of the rays into `of` sets; all rays where there are too few."""
         if self.count < LEAST_SHARED * of:
             return self
         mine = np.sort(np.random.default_rng(0).permutation(self.count)[k::of])
