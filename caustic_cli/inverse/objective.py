@@ -78,14 +78,12 @@ def penalty_of(scene: Scene, field: HeightField, loss: str, limits: Limits, devi
 
 @dataclass(frozen=True)
 class SourceBlur:
-    """What the extent of the source does to the image of its points.
+    """What the extent of the source does to the image of its points."""
 
-    spread: convolution for the image of each point, with the section of the source that it represents; empty for rays of the whole
-    source.  The image is then traced on a margin from which light is spread onto screen and apron.
-    expected: fraction of the light that can be on screen and apron behind the blur.
-    """
-
+    #: Convolution for the image of each point, with the section of the source that it represents; empty for rays of the whole
+    #: source.  The image is then traced on a margin from which light is spread onto screen and apron.
     spread: Sequence[Convolution] = ()
+    #: Fraction of the light that can be on screen and apron behind the blur.
     expected: float = 1.0
 
     @property

@@ -38,13 +38,11 @@ KEPT = 1 << 30
 @dataclass(frozen=True)
 class Contribution:
     """Light of one wavelength and one mode, a point of the source: phase (n, m) rad at h_0 in [0, 2 pi), its derivative with
-    respect to the height (n, m) rad/mm, amplitude (n, m), masks of samples on pixels, and total power.
-
-    front: shared by parts with the same rays.
-    """
+    respect to the height (n, m) rad/mm, amplitude (n, m), masks of samples on pixels, and total power."""
 
     line: Line
     mode: int
+    #: Shared by parts with the same rays.
     front: Wavefront
     phase: Tensor
     slope: Tensor

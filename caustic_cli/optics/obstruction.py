@@ -40,15 +40,16 @@ DOUBLINGS, BISECTIONS, SHORTER = 16, 7, 0.95
 
 @dataclass(frozen=True)
 class Body:
-    """A box or a cylinder, with the name by which messages call it.
-
-    origin: mm; axes: unit vectors of its frame; aperture: its outline along x and y; depth: range along z, mm.
-    """
+    """A box or a cylinder, with the name by which messages call it."""
 
     name: str
+    #: mm.
     origin: tuple[float, float, float]
+    #: Unit vectors of its frame.
     axes: Axes
+    #: Its outline along x and y.
     aperture: Aperture
+    #: Range along z, mm.
     depth: tuple[float, float] = (0.0, 0.0)
 
     def crossed(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:

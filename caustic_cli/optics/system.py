@@ -35,23 +35,20 @@ ENTRANCE, EXIT = "entrance", "exit"
 
 @dataclass(frozen=True)
 class Element:
-    """One surface of a system; see the module.
+    """One surface of a system; see the module."""
 
-    Args:
-        name: of the element, and key of its surface's heights.
-        interaction: refract or reflect.
-        behind: the medium behind it; ignored for a mirror.
-        fresnel: reflection losses of a refracting surface: none, schlick or exact.
-        roughness: standard deviation, along either axis, of the slopes of its microfacets relative to the smooth surface.
-    """
-
+    #: Of the element, and key of its surface's heights.
     name: str
     surface: Surface
     aperture: Aperture = field(default_factory=Aperture)
+    #: refract or reflect.
     interaction: str = "refract"
+    #: The medium behind it; ignored for a mirror.
     behind: Medium = AIR
     pose: Pose = field(default_factory=Pose)
+    #: Reflection losses of a refracting surface: none, schlick or exact.
     fresnel: str = "exact"
+    #: Standard deviation, along either axis, of the slopes of its microfacets relative to the smooth surface.
     roughness: float = 0.0
 
     def __post_init__(self):
@@ -144,25 +141,23 @@ class PlacedScreen:
 class System:
     """A sequential system; see the module.
 
-    Args:
-        sources: simultaneous, mutually incoherent sources.
-        elements: in the order in which light reaches them.
-        screens: each collects all light in its plane, as if the others were absent.
-        object_space: the medium in front of the first element.
-        lit: the pupil that the sources illuminate; None for the first element's aperture.
-        leg: the segment of a folded axis that a `Screen` refers to; None for a straight axis.
-
     Raises:
         InputError: there is no element or no source, names are not unique, the first aperture is infinite, or an element is
             parallel to the axis.
     """
 
+    #: Simultaneous, mutually incoherent sources.
     sources: tuple[Source, ...]
+    #: In the order in which light reaches them.
     elements: tuple[Element, ...]
+    #: Each collects all light in its plane, as if the others were absent.
     screens: tuple[Screen | PlacedScreen, ...] = ()
     light: Light = field(default_factory=Light)
+    #: The medium in front of the first element.
     object_space: Medium = AIR
+    #: The pupil that the sources illuminate; None for the first element's aperture.
     lit: Pupil | None = None
+    #: The segment of a folded axis that a `Screen` refers to; None for a straight axis.
     leg: AxisSegment | None = None
 
     def __post_init__(self):

@@ -47,25 +47,20 @@ from caustic_cli.scene.materials import refractive_index
 
 @dataclass(frozen=True)
 class Band:
-    """Light that one trace covers: one source, one refractive index and one state of polarisation.
-
-    weight: fraction of the total power; channel: colour channel of the image, None for an image without colours; member: index of
-    the source among several, None for a single one.
-    """
+    """Light that one trace covers: one source, one refractive index and one state of polarisation."""
 
     scene: Scene
+    #: Fraction of the total power.
     weight: float = 1.0
+    #: Colour channel of the image, None for an image without colours.
     channel: int | None = None
+    #: Index of the source among several, None for a single one.
     member: int | None = None
 
 
 @dataclass(frozen=True)
 class Scene:
     """Source, lens and screen on one optical axis (z); lengths in mm, powers in the unit of `light`.
-
-    second_target: what the light must do behind the screen, for a lens with two free-form sides.
-    elements: other lenses and fold mirrors, in the order in which light reaches them; behind a mirror, z and the screen refer to
-    the folded axis.
 
     Raises:
         InputError: the screen is not behind the lens, or the source not in front of it; a curved screen is larger than its sphere
@@ -76,7 +71,10 @@ class Scene:
     lens: Lens
     screen: Screen
     light: Light = field(default_factory=Light)
+    #: What the light must do behind the screen, for a lens with two free-form sides.
     second_target: SecondTarget | None = None
+    #: Other lenses and fold mirrors, in the order in which light reaches them; behind a mirror, z and the screen refer to the
+    #: folded axis.
     elements: tuple[Component, ...] = ()
 
     def __post_init__(self):

@@ -76,14 +76,13 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class FormError:
-    """A random form error.
+    """A random form error."""
 
-    rms: mm, over all realisations; exponent: of its two-dimensional power spectral density; longest, shortest: its range of spatial
-    wavelengths, mm, longest None for the lens' larger side.
-    """
-
+    #: mm, over all realisations.
     rms: float
+    #: Of its two-dimensional power spectral density.
     exponent: float = 2.0
+    #: Its range of spatial wavelengths, mm, longest None for the lens' larger side.
     longest: float | None = None
     shortest: float = 1.0
 

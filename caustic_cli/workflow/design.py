@@ -169,14 +169,13 @@ def _with_lens(project: Project, problem: OneSurface, **values: Any) -> tuple[Pr
 
 @dataclass(frozen=True)
 class Result:
-    """A finished design: its project, its lens, and the figures of the JSON table.
-
-    scene: with the designed entrance, if that is free-form; heights: (n, m) mm of the exit.
-    """
+    """A finished design: its project, its lens, and the figures of the JSON table."""
 
     project: Project
+    #: With the designed entrance, if that is free-form.
     scene: Scene
     field: HeightField
+    #: (n, m) mm of the exit.
     heights: torch.Tensor
     target: np.ndarray
     state: State

@@ -25,14 +25,11 @@ EQUATOR = 1.0 - 1e-9
 
 @dataclass(frozen=True)
 class Sphere(Surface[None]):
-    """A spherical surface of signed radius R, mm, not 0; infinite for a plane.
+    """A spherical surface of signed radius R, mm, not 0; infinite for a plane."""
 
-    Args:
-        radius: R.
-        reach: semi-aperture for which its bounds hold, mm.
-    """
-
+    #: R.
     radius: float
+    #: Semi-aperture for which its bounds hold, mm.
     reach: float = math.inf
 
     def __post_init__(self):

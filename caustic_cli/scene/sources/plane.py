@@ -14,15 +14,12 @@ from caustic_cli.scene.sources.section import SourceType, Table
 
 @dataclass(frozen=True, eq=False)
 class PlaneWave(Source):
-    """A collimated beam at normal incidence on the entrance, as wide as the lens' aperture.
+    """A collimated beam at normal incidence on the entrance, as wide as the lens' aperture."""
 
-    Args:
-        power: power through the aperture, W.
-        profile: optional relative irradiance E over the aperture, (a, b) non-negative, [i, j] with i along +x and j
-            along +y, constant on each cell (eq. 4.2.3); None for uniform irradiance.
-    """
-
+    #: Power through the aperture, W.
     power: float = 1.0
+    #: Optional relative irradiance E over the aperture, (a, b) non-negative, [i, j] with i along +x and j along +y, constant on
+    #: each cell (eq. 4.2.3); None for uniform irradiance.
     profile: np.ndarray | None = None
 
     kind = "plane"

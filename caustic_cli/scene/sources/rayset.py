@@ -31,23 +31,21 @@ SHORTEST, LONGEST = 100.0, 20_000.0
 class RaySet:
     """Rays of a source.
 
-    Args:
-        positions: (N, 3) mm, starting point of each ray.
-        directions: (N, 3), of any length but 0; stored as unit vectors.
-        flux: (N,) of each ray, not negative; relative, since the scene gives the power of its source.
-        total: flux of the whole source, in `unit`.
-        unit: W, or lm.
-        wavelengths: (N,) nm, or None.
-
     Raises:
         InputError: there are no rays, a number is not finite, a direction is zero, or a flux is negative or the total is 0.
     """
 
+    #: (N, 3) mm, starting point of each ray.
     positions: np.ndarray
+    #: (N, 3), of any length but 0; stored as unit vectors.
     directions: np.ndarray
+    #: (N,) of each ray, not negative; relative, since the scene gives the power of its source.
     flux: np.ndarray
+    #: Flux of the whole source, in `unit`.
     total: float = 1.0
+    #: W, or lm.
     unit: str = "W"
+    #: (N,) nm, or None.
     wavelengths: np.ndarray | None = None
 
     def __post_init__(self):

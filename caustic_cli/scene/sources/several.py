@@ -21,15 +21,13 @@ MOST = 64
 class Several(Source):
     """Mutually incoherent sources; each is traced separately, see `Scene.bands`.
 
-    Args:
-        members: two or more sources, none of them a `Several`.
-        spectra: wavelengths, nm, and relative powers of each; empty if not given.
-
     Raises:
         InputError: there are too few or too many, or only some of them have wavelengths.
     """
 
+    #: Two or more sources, none of them a `Several`.
     members: tuple[Source, ...] = ()
+    #: Wavelengths, nm, and relative powers of each; empty if not given.
     spectra: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
 
     kind = "several"
