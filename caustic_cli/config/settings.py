@@ -448,7 +448,7 @@ def build_screen(screen: ScreenSettings) -> Screen:
 
 def build_light(settings: Settings) -> Light:
     """Wavelengths and polarisation of the [source] section, combined for several sources."""
-    return sources.light_of_all(settings.source, settings.target.color)
+    return sources.several.light_of_all(settings.source, settings.target.color)
 
 
 def refuse_unused(source: Mapping[str, Any], given: Iterable[str], stages: Sequence[str | None] = ()) -> None:
