@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from caustic_cli.config.design import relative_to_initial
+from caustic_cli.config.exclusions import refuse_excluded
 from caustic_cli.config.optional import (
     complete_elements,
     complete_network,
@@ -86,8 +87,7 @@ def _aspect_of_a_sheet(s: Settings, aspect: float) -> float:
 
 def _in_colour(s: Settings) -> Settings:
     """Settings with the wavelengths of a coloured picture, and a glass whose dispersion is known."""
-    if s.source.also:
-        raise InputError("[[source]] of a coloured picture must be one, whose three wavelengths are its colours")
+    refuse_excluded("target.color", s)
     lens = s.lens if "index" in s.lens else s.lens.filled(glass=COLOR_GLASS)
     return s.changed(source=s.source.filled(wavelengths=RGB), lens=lens)
 

@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from caustic_cli.config.default_stages import Table, refinement
+from caustic_cli.config.exclusions import refuse_excluded
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
@@ -54,8 +55,7 @@ class NetworkOverRange(OneSurface):
     def complete(cls, d: Defaults) -> None:
         super().complete(d)
         _refuse_idle_inputs(d.trained, d.design.initial)
-        if d.design.robust:
-            raise InputError("⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already")
+        refuse_excluded("design.over", d.s)
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:

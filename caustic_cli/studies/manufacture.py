@@ -27,6 +27,7 @@ from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Aperture, Scene
 from caustic_cli.scene.materials import material
+from caustic_cli.scene.traits import Capability
 
 #: Most sample points along each axis and per knot span.
 MOST, A_SPAN = 2001, 4
@@ -112,9 +113,15 @@ def _within(aperture: Aperture, z: Tensor) -> Tensor:
     return aperture.covers(u[:, None], v[None, :])
 
 
+WALL = Capability(
+    "wall and stock of a design",
+    {"mirror": "a mirror has no glass", "two sides": "heights are measured from a flat entrance"},
+)
+
+
 def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[str, float]:
     """Least and largest height above the flat entrance, mm, as of `manufacture`; nothing of a mirror or a free-form entrance."""
-    if scene.lens.mirror or scene.two_sided:
+    if not WALL.supports(scene):
         return {}
     (z,) = sampled(field, heights, [_points(s) for s in field.spaces], ((0, 0),))
     z = z[_within(scene.lens.opening, z)]
