@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 from caustic_cli.config.settings import Settings
@@ -19,22 +18,25 @@ def _by_settings(capability: Capability) -> dict[str, str]:
     return {entry: message for trait, message in capability.unsupported.items() for entry in TRAITS[trait].settings}
 
 
-_SIDES = "⟨{path}⟩ cannot be combined with ⟨{feature}⟩, which needs two free-form sides of heights by lbfgs"
 _LENSLETS = (
     "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none and optimizer"
     " lbfgs"
 )
-_FREE_INDEX = "⟨{path}⟩ of a free gradient must be {default}, got {value}"
+_TWO_SIDES = {
+    **dict.fromkeys(
+        ("lens.mirror", "target.color", "lens.gradient", "lens.array", "design.robust", "design.network", "design.optimizer"),
+        "⟨{path}⟩ cannot be combined with ⟨{feature}⟩, which needs two free-form sides of heights by lbfgs",
+    ),
+    **dict.fromkeys(("source.also", "source.type rays"), "⟨{feature}⟩ needs one source that is no ray file"),
+    "design.waves on": WAVE_REFINEMENT.unsupported["two sides"],
+}
 
-#: Feature -> what excludes it -> message: a setting with any value but the default, or with one.  In messages {path} and {value}
-#: are those of that setting, {said} both of them, or the path of a flag alone, {default} its default, and {feature} the setting by
-#: which the feature was asked for.
-EXCLUDED: Mapping[str, Mapping[str, str]] = {
-    "second": {
-        **dict.fromkeys(("lens.mirror", "target.color", "lens.gradient", "lens.array"), _SIDES),
-        **dict.fromkeys(("design.robust", "design.network", "design.optimizer"), _SIDES),
-        **dict.fromkeys(("source.also", "source.type rays"), "⟨{feature}⟩ needs one source that is no ray file"),
-    },
+#: Feature -> settings that exclude it -> message.  Both are settings with any value but the default, or with one.  In messages
+#: {path} and {value} are those of the setting, {said} both of them, or the path of a flag alone, {default} its default, and
+#: {feature} the feature.
+EXCLUDED: dict[str, dict[str, str]] = {
+    "target.color": {"source.also": "[[source]] of a coloured picture must be one, whose three wavelengths are its colours"},
+    **dict.fromkeys(TRAITS["two sides"].settings, _TWO_SIDES),
     "element": {
         **dict.fromkeys(TRAITS["two sides"].settings, "⟨{path}⟩" + NOT_BESIDE),
         **dict.fromkeys(("design.robust", "design.waves on", "lens.gradient"), "{said}" + NOT_BESIDE),
@@ -43,16 +45,21 @@ EXCLUDED: Mapping[str, Mapping[str, str]] = {
         ("design.network", "design.optimizer", "target.color"),
         "{said} cannot be combined with ⟨element.free⟩: it is not implemented beside other free surfaces",
     ),
-    "lens.array": dict.fromkeys(("design.start offset", "design.network", "design.optimizer"), _LENSLETS),
     "lens.gradient free": {
+        "lens.mirror": "⟨lens.gradient⟩ free needs a lens: light never enters a mirror",
         "lens.array": "⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat",
         "target.color": "⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength",
         "design.robust": "{said} averages over errors of a designed surface, but ⟨lens.gradient⟩ free designs the index",
-        **dict.fromkeys(("design.network", "design.optimizer", "design.loss"), _FREE_INDEX),
+        **dict.fromkeys(
+            ("design.network", "design.optimizer", "design.loss"), "⟨{path}⟩ of a free gradient must be {default}, got {value}"
+        ),
         "design.waves on": WAVE_REFINEMENT.unsupported["gradient index"],
     },
-    "target.color": {"source.also": "[[source]] of a coloured picture must be one, whose three wavelengths are its colours"},
     "design.over": {"design.robust": "⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already"},
+}
+#: The same of what follows from other settings, too.
+EXCLUDED_LATER: dict[str, dict[str, str]] = {
+    "lens.array": dict.fromkeys(("design.start offset", "design.network", "design.optimizer"), _LENSLETS),
     "design.waves on": {
         "design.network": "⟨design.waves⟩ on needs network none: the wave image is refined by control heights",
         **_by_settings(WAVE_REFINEMENT),
@@ -65,33 +72,53 @@ EXCLUDED: Mapping[str, Mapping[str, str]] = {
 }
 
 
+def _values(path: str, s: Settings) -> list[Any]:
+    """The value of a setting, or those of all elements; none for the default."""
+    if path == "element":
+        return list(s.elements)
+    found = [element.free for element in s.elements] if path == "element.free" else [s.value(path)]
+    flat = path == "screen.radius" and found[0] is not None and all(map(math.isinf, found[0]))
+    return [] if flat else [value for value in found if value not in (None, _default(path))]
+
+
 def _default(path: str) -> Any:
     return default(path) if path in TABLE else ()
 
 
-def _found(path: str, s: Settings) -> Any:
-    """The value of a setting, or the tables of elements; None for the default."""
-    value = s.elements if path == "element" else s.value(path)
-    plane = path == "screen.radius" and value is not None and all(map(math.isinf, value))
-    return None if plane or value == _default(path) else value
+def _has(entry: str, s: Settings) -> bool:
+    """Whether there is a setting with any value but the default, or with one."""
+    path, _, only = entry.partition(" ")
+    found = _values(path, s)
+    return only in found if only else bool(found)
 
 
-def why_excluded(feature: str, s: Settings, by: str = "") -> str:
-    """Why settings exclude a feature, "" if they do not; by: the path of the setting that asks for it."""
-    for entry, message in EXCLUDED[feature].items():
-        path, _, only = entry.partition(" ")
-        value = _found(path, s)
-        if value == only if only else value is not None:
+def why_excluded(feature: str, s: Settings) -> str:
+    """Why settings exclude a feature, "" if they do not."""
+    for entry, message in (EXCLUDED | EXCLUDED_LATER)[feature].items():
+        if _has(entry, s):
+            path = entry.partition(" ")[0]
+            value = _values(path, s)[0]
             said = f"⟨{path}⟩" if value is True else f"⟨{path}⟩ {value}"
-            return message.format(path=path, value=value, said=said, default=_default(path), feature=by or feature)
+            return message.format(path=path, value=value, said=said, default=_default(path), feature=feature)
     return ""
 
 
-def refuse_excluded(feature: str, s: Settings, by: str = "") -> None:
-    """Refuse settings that exclude a feature; arguments as of `why_excluded`.
+def refuse_excluded(feature: str, s: Settings) -> None:
+    """Refuse settings that exclude a feature.
 
     Raises:
         InputError: they do.
     """
-    if why := why_excluded(feature, s, by):
+    if why := why_excluded(feature, s):
         raise InputError(why)
+
+
+def refuse_contradictions(s: Settings) -> None:
+    """Refuse settings of which one excludes another.
+
+    Raises:
+        InputError: there are such.
+    """
+    for feature in EXCLUDED:
+        if _has(feature, s):
+            refuse_excluded(feature, s)

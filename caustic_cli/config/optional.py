@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.config.exclusions import refuse_excluded
 from caustic_cli.config.settings import Settings, build_source
 from caustic_cli.config.table import (
     DesignSettings,
@@ -93,7 +92,6 @@ def complete_second(s: Settings) -> SecondSettings | None:
         second = second.changed(focus=check("second.focus", places[0] if len(places) == 1 else places))
     if "file" in second and "z" not in second:
         raise InputError("⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen")
-    refuse_excluded("second", s, f"second.{said[0]}")
     return second
 
 
@@ -116,10 +114,6 @@ def complete_second_size(s: Settings) -> SecondSettings | None:
 
 def complete_elements(s: Settings) -> tuple[ElementSettings, ...]:
     """Other lenses and mirrors with their default sizes, and checks of unsupported combinations."""
-    if s.elements:
-        refuse_excluded("element", s)
-    if any(element.free != "none" for element in s.elements):
-        refuse_excluded("element.free", s)
     return tuple(_complete_element(element, s) for element in s.elements)
 
 

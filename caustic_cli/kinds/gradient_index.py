@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from caustic_cli.config.default_stages import refinement, transport_cells
-from caustic_cli.config.exclusions import refuse_excluded
 from caustic_cli.config.settings import Settings
 from caustic_cli.config.table import LensSettings, ScreenSettings, check, check_all
 from caustic_cli.errors import InputError
@@ -43,8 +42,6 @@ class IndexPlate(OneSurface):
     @classmethod
     def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
         """A plane-parallel blank; its sides have the smallest control net."""
-        if lens.mirror:
-            raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
         lens = lens.filled(radius=(math.inf, math.inf))
         if any(map(math.isfinite, lens.radius)):
             raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {list(lens.radius)}")
@@ -65,7 +62,6 @@ class IndexPlate(OneSurface):
         if not d.source.collimated:
             raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s.source.type}")
         check("design.waves", design.waves)
-        refuse_excluded("lens.gradient free", s)
         if design.get("start", "offset") not in ("offset", "transport"):
             raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design.start}")
         d.set_design(start="offset")  # of the surface, which is flat; the index starts from optimal transport

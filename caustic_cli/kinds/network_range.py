@@ -9,7 +9,6 @@ from typing import Any
 from torch import Tensor
 
 from caustic_cli.config.default_stages import Table, refinement
-from caustic_cli.config.exclusions import refuse_excluded
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
@@ -55,7 +54,6 @@ class NetworkOverRange(OneSurface):
     def complete(cls, d: Defaults) -> None:
         super().complete(d)
         _refuse_idle_inputs(d.trained, d.design.initial)
-        refuse_excluded("design.over", d.s)
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:

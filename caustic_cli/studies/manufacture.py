@@ -148,13 +148,22 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -
     )
 
 
+THROW = Capability(
+    "advice on the throw of a thinner plate",
+    {
+        "near source": "the relief collects the light of the source, whatever the throw",
+        "mirror": "its relief is not that of a sheet",
+        "other elements": "they decide the throw, too",
+    },
+)
+
+
 def _thinner(scene: Scene, low: float, high: float) -> str:
     """Advice on the throw at which a plate, whose surface lies between two heights, mm, is as thin as sheet material: relief ~ 1 /
-    throw for a distant source; near a source the relief collects its light, whatever the throw."""
+    throw."""
     sheet = SHEET * max(scene.lens.size)
     room = sheet - (low - scene.lens.z_in)  # not positive for a lens that is not a plate
-    near = math.isfinite(scene.source.nearest)
-    if near or scene.lens.mirror or scene.elements or not 0.0 < room < high - low:
+    if not (THROW.supports(scene) and 0.0 < room < high - low):
         return ""
     middle = scene.lens.offset.thickness
     throw = float(f"{middle + (scene.screen.z - middle) * (high - low) / room:.2g}")
