@@ -59,6 +59,7 @@ SCRIPT = Capability(
         "two sides": ONE_SIDE,
         "other elements": ONE_LENS,
         **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
+        "gradient index": SHAPE,
         "lumens": "⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written",
         "uneven plane wave": "⟨script⟩: its source is uniform, so one with a profile cannot be written",
         **dict.fromkeys(
@@ -66,6 +67,7 @@ SCRIPT = Capability(
             "⟨script⟩: its source is evenly bright and uniform or Lambertian, so a picture, a table or a ray file cannot be"
             " written",
         ),
+        **dict.fromkeys(("several sources", "user-defined source"), SOURCE),
         "elliptical disc": "⟨script⟩: its disc is round, so an elliptical one cannot be written",
         "circular aperture": "⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written",
     },

@@ -65,14 +65,15 @@ TRAITS: Mapping[str, Trait] = {
     "several sources": Trait("several sources", lambda s: len(s.source.members) > 1, ("source.also",)),
     "ray file": Trait("the rays of a file", lambda s: s.source.rays is not None, ("source.type rays",)),
     "ray file among sources": Trait(
-        "the rays of a file", lambda s: len(s.source.members) > 1 and any(one.rays is not None for one in s.source.members)
+        "the rays of a file among several sources",
+        lambda s: len(s.source.members) > 1 and any(one.rays is not None for one in s.source.members),
     ),
     "user-defined source": Trait("a user-defined type of source", lambda s: s.source.kind not in KNOWN_SOURCES),
     "near source": Trait("a source nearby", lambda s: not s.source.distant, ("source.position",)),
     "light not parallel": Trait("light that is not parallel", lambda s: not s.source.collimated),
     "separate places": Trait("sources in separate places", lambda s: s.source.apart),
     "uneven plane wave": Trait("a profile of its irradiance", lambda s: s.source.profile is not None, ("source.profile",)),
-    "uneven source": Trait("a picture of its radiance", lambda s: s.source.brightness is not None, ("source.brightness",)),
+    "uneven source": Trait("a picture of its radiance", lambda s: s.source.brightness is not None),
     "tabulated intensity": Trait("a table of its intensity", lambda s: not isinstance(s.source.intensity, str)),
     "uneven points": Trait("points of another than uniform intensity", lambda s: _points(s) and s.source.intensity != "uniform"),
     "disc at infinity": Trait("a disc at infinity", lambda s: _disc(s) and s.source.distant, ("source.angle",)),
