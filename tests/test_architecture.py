@@ -21,40 +21,27 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 #: scene -> errors, with studies and exports beside the inverse problem.  They write files and pictures, through io, by which config
 #: reads project.toml.  The table of settings is data that stands below every room; the completion of all settings ends with that of
 #: the kind of design, and stands above both.
+BOTTOM = {"table", "errors", "loading"}
 ALLOWED = {
-    "scene": {"scene", "table", "errors"},
-    "optics": {"optics", "table", "scene", "errors"},
-    "inverse": {"inverse", "table", "optics", "scene", "errors"},
-    "io": {"io", "table", "optics", "scene", "errors"},
-    "export": {"export", "table", "optics", "scene", "errors", "io"},
-    "studies": {"studies", "table", "optics", "scene", "errors", "io"},
-    "table": {"table", "errors"},
-    "config": {"config", "table", "inverse", "io", "optics", "scene", "errors"},
-    "kinds": {"kinds", "config", "table", "inverse", "studies", "io", "optics", "scene", "errors"},
-    "completion": {"completion", "kinds", "config", "table", "inverse", "optics", "scene", "errors"},
-    "project": {"project", "completion", "kinds", "table", "config", "inverse", "io", "optics", "scene", "errors"},
-    "workflow": {
-        "workflow",
-        "completion",
-        "kinds",
-        "table",
-        "project",
-        "config",
-        "inverse",
-        "studies",
-        "export",
-        "io",
-        "optics",
-        "scene",
-        "errors",
-    },
+    "table": BOTTOM,
+    "scene": {"scene"} | BOTTOM,
+    "optics": {"optics", "scene"} | BOTTOM,
+    "inverse": {"inverse", "optics", "scene"} | BOTTOM,
+    "io": {"io", "optics", "scene"} | BOTTOM,
+    "export": {"export", "optics", "scene", "io"} | BOTTOM,
+    "studies": {"studies", "optics", "scene", "io"} | BOTTOM,
+    "config": {"config", "inverse", "io", "optics", "scene"} | BOTTOM,
+    "kinds": {"kinds", "config", "inverse", "studies", "io", "optics", "scene"} | BOTTOM,
+    "completion": {"completion", "kinds", "config", "inverse", "optics", "scene"} | BOTTOM,
+    "project": {"project", "completion", "kinds", "config", "inverse", "io", "optics", "scene"} | BOTTOM,
 }
+ALLOWED["workflow"] = {"workflow", "studies", "export"} | ALLOWED["project"]
 TABLE_MODULES = {"caustic_cli.config.table", "caustic_cli.config.checks"}
 COMPLETION = "caustic_cli.config.completion"
 #: Only the command line may import the command line.
 TOP = {"cli", "__main__", "commands"}
 #: What the package's top level holds, besides the rooms.
-FRONT = {"__init__.py", "__main__.py", "cli.py", "errors.py"}
+FRONT = {"__init__.py", "__main__.py", "cli.py", "errors.py", "loading.py"}
 #: Files, formats and terminals: none of it below the command line's own modules.
 OUTSIDE = {"typer", "rich", "click", "PIL", "h5py", "tomli_w", "tomllib", "json", "csv", "argparse", "matplotlib"}
 
@@ -65,7 +52,7 @@ def module_name(path: Path) -> str:
 
 
 def imports_in(tree: ast.AST, name: str, is_package: bool) -> set[str]:
-    """Full names of all modules imported anywhere in a file; for `from a import b` both a and a.b."""
+    """Full names of all modules imported anywhere in a file, or on demand; for `from a import b` both a and a.b."""
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -76,6 +63,8 @@ def imports_in(tree: ast.AST, name: str, is_package: bool) -> set[str]:
                 parents = name.split(".")[: None if is_package and node.level == 1 else -(node.level - is_package)]
                 base = ".".join([*parents, *([base] if base else [])])
             found |= {base} | {f"{base}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "OnDemand":
+            found.add(ast.literal_eval(node.args[0]))
     return found
 
 
