@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 from caustic_cli.config.settings import Settings
 from caustic_cli.config.table import TABLE, default
 from caustic_cli.errors import InputError
@@ -72,34 +69,13 @@ EXCLUDED_LATER: dict[str, dict[str, str]] = {
 }
 
 
-def _values(path: str, s: Settings) -> list[Any]:
-    """The value of a setting, or those of all elements; none for the default."""
-    if path == "element":
-        return list(s.elements)
-    found = [element.free for element in s.elements] if path == "element.free" else [s.value(path)]
-    flat = path == "screen.radius" and found[0] is not None and all(map(math.isinf, found[0]))
-    return [] if flat else [value for value in found if value not in (None, _default(path))]
-
-
-def _default(path: str) -> Any:
-    return default(path) if path in TABLE else ()
-
-
-def _has(entry: str, s: Settings) -> bool:
-    """Whether there is a setting with any value but the default, or with one."""
-    path, _, only = entry.partition(" ")
-    found = _values(path, s)
-    return only in found if only else bool(found)
-
-
 def why_excluded(feature: str, s: Settings) -> str:
     """Why settings exclude a feature, "" if they do not."""
     for entry, message in (EXCLUDED | EXCLUDED_LATER)[feature].items():
-        if _has(entry, s):
+        if value := s.chosen(entry):
             path = entry.partition(" ")[0]
-            value = _values(path, s)[0]
-            said = f"⟨{path}⟩" if value is True else f"⟨{path}⟩ {value}"
-            return message.format(path=path, value=value, said=said, default=_default(path), feature=feature)
+            said, usual = f"⟨{path}⟩" if value is True else f"⟨{path}⟩ {value}", default(path) if path in TABLE else ""
+            return message.format(path=path, value=value, said=said, default=usual, feature=feature)
     return ""
 
 
@@ -120,5 +96,5 @@ def refuse_contradictions(s: Settings) -> None:
         InputError: there are such.
     """
     for feature in EXCLUDED:
-        if _has(feature, s):
+        if s.chosen(feature):
             refuse_excluded(feature, s)
