@@ -10,10 +10,10 @@ from caustic_cli.errors import InputError
 from caustic_cli.scene import sources
 from caustic_cli.scene.aperture import Aperture, CircularAperture, Pupil
 from caustic_cli.scene.elements import (
+    BESIDE_ELEMENTS,
     COMPONENTS,
     Component,
     FoldMirror,
-    check_compatible_with_elements,
     check_positions,
     surface_name,
 )
@@ -100,13 +100,14 @@ class Scene:
                     refractive_index(glass, wavelength)
 
     def _check_elements(self) -> None:
-        if not self.elements:
-            return
-        lens = self.lens
-        second = "second.file" if self.second is None else self.second.setting
-        wrong = {"lens.mirror": lens.mirror, "lens.gradient": lens.gradient is not None, "lens.array": lens.arrayed}
-        check_compatible_with_elements(wrong | {second: self.two_sided, "source.type": self.source.rays is not None and "rays"})
-        check_positions(self.elements, (lens.z_in, lens.offset.thickness), self.source.nearest, self.screen.z)
+        if self.elements:
+            BESIDE_ELEMENTS.refuse(self)
+            check_positions(self.elements, (self.lens.z_in, self.lens.offset.thickness), self.source.nearest, self.screen.z)
+
+    @property
+    def second_setting(self) -> str:
+        """Path of the setting by which a lens has two free-form sides."""
+        return "second.file" if self.second is None else self.second.setting
 
     @property
     def before(self) -> tuple[Component, ...]:
