@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from caustic_cli.config.design import relative_to_initial
+from caustic_cli.config.exclusions import refuse_contradictions
 from caustic_cli.config.optional import (
     complete_elements,
     complete_network,
@@ -52,6 +53,7 @@ def complete(
         InputError: a value is out of range, or two contradict each other.
     """
     s, by = Settings.of(given), by or Parameters()
+    refuse_contradictions(s)
     if s.target.sheet:
         aspect, lit = _aspect_of_a_sheet(s, aspect), (1.0, 1.0)
     s = _in_colour(s) if s.target.color else s
@@ -87,8 +89,6 @@ def _aspect_of_a_sheet(s: Settings, aspect: float) -> float:
 
 def _in_colour(s: Settings) -> Settings:
     """Settings with the wavelengths of a coloured picture, and a glass whose dispersion is known."""
-    if s.source.also:
-        raise InputError("[[source]] of a coloured picture must be one, whose three wavelengths are its colours")
     lens = s.lens if "index" in s.lens else s.lens.filled(glass=COLOR_GLASS)
     return s.changed(source=s.source.filled(wavelengths=RGB), lens=lens)
 

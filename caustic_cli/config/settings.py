@@ -20,6 +20,7 @@ import tomli_w
 
 from caustic_cli import __version__
 from caustic_cli.config.table import (
+    TABLE,
     DesignSettings,
     ElementSettings,
     LensSettings,
@@ -31,6 +32,7 @@ from caustic_cli.config.table import (
     StageSettings,
     TargetSettings,
     check,
+    default,
     in_section,
 )
 from caustic_cli.errors import InputError, alternatives, near
@@ -270,6 +272,21 @@ class Settings:
         section, _, key = path.partition(".")
         return getattr(getattr(self, section), key, None)
 
+    def chosen(self, entry: str) -> Any:
+        """The value of a setting that is not the default, of a section or of an [[element]] table; None without one.
+
+        entry: path or section; after a blank, the only value that counts.
+        """
+        path, _, only = entry.partition(" ")
+        section, _, key = path.partition(".")
+        sections = self.elements if section == "element" else (getattr(self, section),)
+        usual = default(path) if path in TABLE else None
+        for value in (getattr(one, key, None) if key else one for one in sections):
+            plane = path == "screen.radius" and value and all(map(math.isinf, value))
+            if value and value != usual and (value == only if only else not plane):
+                return value
+        return None
+
 
 def dump(settings: Settings) -> str:
     """TOML text in the order of the schema, each key with a comment of its unit and meaning."""
@@ -455,7 +472,7 @@ def build_screen(screen: ScreenSettings) -> Screen:
 
 def build_light(settings: Settings) -> Light:
     """Wavelengths and polarisation of the [source] section, combined for several sources."""
-    return sources.light_of_all(settings.source, settings.target.color)
+    return sources.several.light_of_all(settings.source, settings.target.color)
 
 
 def refuse_unused(source: Mapping[str, Any], given: Iterable[str], stages: Sequence[str | None] = ()) -> None:

@@ -43,7 +43,17 @@ from caustic_cli.optics.surfaces import HeightField, Plane
 from caustic_cli.optics.system import ENTRANCE, EXIT, Element, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene
+from caustic_cli.scene.traits import Capability
 
+INDEX_DESIGN = Capability(
+    "design of a gradient index",
+    {
+        "light not parallel": "⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane",
+        **dict.fromkeys(
+            ("mirror", "coloured picture"), "⟨lens.gradient⟩ free is designed for lenses, and for pictures without colours"
+        ),
+    },
+)
 #: Fixed-point iterations of the initial sines.
 SINES = 3
 #: Rays per pixel of the optimisation; oversampling of the render along each axis.
@@ -169,10 +179,7 @@ class _Layers:
 def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], limits: tuple[float, float], cells: int) -> Tensor:
     """Control values (n, m) of the initial index within its limits, independent of z; errors as of `design_gradient_index`."""
     lens, (low, high) = scene.lens, limits
-    if not scene.source.collimated:
-        raise InputError("⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane")
-    if lens.mirror or scene.colored:
-        raise InputError("⟨lens.gradient⟩ free is designed for lenses, and for pictures without colours")
+    INDEX_DESIGN.refuse(scene)
     if not 1.0 <= low < high <= 5.0:
         raise InputError(f"⟨lens.index_range⟩ must ascend within 1 to 5, got [{low:g}, {high:g}]")
     if not lens.offset.thickness > lens.z_in:
