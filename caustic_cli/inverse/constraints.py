@@ -76,19 +76,19 @@ def within_limits(
     if not (max_slope > 0 or min_radius > 0):
         return heights
     asked = _Constraints(field, bounds, max_slope * (1.0 - SPARE), min_radius / (1.0 - SPARE), CHECKED)
-    found, room = heights, LEFT + ROOM
+    candidate, room = heights, LEFT + ROOM
     for _ in range(TRIES):
-        over = asked.excess(found)
+        over = asked.excess(candidate)
         if over <= 0:
-            return found
-        if found is not heights:
+            return candidate
+        if candidate is not heights:
             room += max(1.5 * over, LEFT)
         if room >= 1.0:  # between the points it exceeds the limits many times over, as at the creases between lenslets
             break
-        found = _descend(_Constraints(field, bounds, max_slope * (1.0 - room), min_radius / (1.0 - room), A_SPAN), found)
-    if asked.excess(found) <= 0:
-        return found
-    raise _none(asked.excess(found))
+        candidate = _descend(_Constraints(field, bounds, max_slope * (1.0 - room), min_radius / (1.0 - room), A_SPAN), candidate)
+    if asked.excess(candidate) <= 0:
+        return candidate
+    raise _none(asked.excess(candidate))
 
 
 def _descend(limits: _Constraints, heights: Tensor) -> Tensor:
@@ -99,12 +99,12 @@ def _descend(limits: _Constraints, heights: Tensor) -> Tensor:
     method = LBFGS(evaluate, heights.detach().double().reshape(-1).clone())
     for _ in range(STEPS):
         moved = method.step()
-        found = method.x.view(heights.shape)
-        if limits.excess(found) <= LEFT:
-            return found.clone()
+        candidate = method.x.view(heights.shape)
+        if limits.excess(candidate) <= LEFT:
+            return candidate.clone()
         if not moved:
             break
-    raise _none(limits.excess(found))
+    raise _none(limits.excess(candidate))
 
 
 def _none(excess: float) -> CausticError:

@@ -71,26 +71,26 @@ class Method:
 def intersect_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
     """`Surface.intersect` for any surface, in plain torch."""
     t, status = reference(surface, heights, origin, direction, side)
-    found = status == Status.HIT
-    t, gx, gy = attach(surface, heights, origin, direction, t, found)
-    return SurfaceIntersection(t, gx, gy, found)
+    valid = status == Status.HIT
+    t, gx, gy = attach(surface, heights, origin, direction, t, valid)
+    return SurfaceIntersection(t, gx, gy, valid)
 
 
-def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Make intersections differentiable: t (N,) mm and the slopes there, with first derivatives by heights and rays, in both modes.
 
-    t: roots without derivatives; found: where they are valid, 0 is returned elsewhere.  One Newton step from the root has the value
+    t: roots without derivatives; valid: where they are valid, 0 is returned elsewhere.  One Newton step from the root has the value
     0 and the derivative of the root.  Second derivatives are wrong.
     """
     sag, middle = surface.centred(heights)
     (ox, oy, oz), (dx, dy, dz) = origin, direction
-    t = torch.where(found, t, torch.zeros_like(t)).double()
+    t = torch.where(valid, t, torch.zeros_like(t)).double()
     x, y, z_ray = ox + t * dx, oy + t * dy, (oz - middle) + t * dz
     at = tuple(_primal(torch.as_tensor(c, dtype=torch.float64)).expand(t.shape) for c in (x, y))
     inside_x, inside_y = (c.clamp(-r, r) for c, r in zip(at, surface.half_size, strict=True))
     z, gx, gy = surface.evaluate(sag, inside_x, inside_y)
     if not torch.is_grad_enabled():
-        return t, torch.where(found, gx, torch.zeros_like(t)), torch.where(found, gy, torch.zeros_like(t))
+        return t, torch.where(valid, gx, torch.zeros_like(t)), torch.where(valid, gy, torch.zeros_like(t))
     with torch.no_grad():
         zxx, zxy, zyy = surface.at(sag if sag is None else sag.detach(), inside_x, inside_y, SECOND)
         sx, sy = _primal(gx), _primal(gy)
@@ -98,10 +98,10 @@ def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tenso
         c = fz - sx * fx - sy * fy
         c = torch.where(c.abs() > LEAST_COSINE, c, torch.full_like(c, LEAST_COSINE))
     f = z_ray - z - sx * (x - at[0]) - sy * (y - at[1])
-    move = torch.where(found, -(f - _primal(f)) / c, torch.zeros_like(t))
+    move = torch.where(valid, -(f - _primal(f)) / c, torch.zeros_like(t))
     ax, ay = (x - at[0]) + move * fx, (y - at[1]) + move * fy  # 0 in value, with the derivative of the point
     none = torch.zeros_like(t)
-    return (t + move, torch.where(found, gx + zxx * ax + zxy * ay, none), torch.where(found, gy + zxy * ax + zyy * ay, none))
+    return (t + move, torch.where(valid, gx + zxx * ax + zxy * ay, none), torch.where(valid, gy + zxy * ax + zyy * ay, none))
 
 
 def _primal(value: Tensor) -> Tensor:
@@ -171,11 +171,11 @@ def reference(
     slope = bound[0] * dx.abs() + bound[1] * dy.abs()
     unsafe = ((slope >= dz) & (status == Status.HIT) & ~at_once).nonzero()[:, 0]
     if len(unsafe):
-        found = _first_brackets(
+        valid = _first_brackets(
             lambda t, of: f(t, unsafe[of])[0], low[unsafe], high[unsafe], f_low[unsafe], (dz + slope)[unsafe], (dz - slope)[unsafe]
         )
-        low, high = low.index_copy(0, unsafe, found[0]), high.index_copy(0, unsafe, found[1])
-        status = status.index_copy(0, unsafe, found[2])
+        low, high = low.index_copy(0, unsafe, valid[0]), high.index_copy(0, unsafe, valid[1])
+        status = status.index_copy(0, unsafe, valid[2])
         closed = closed.index_fill(0, unsafe, True)
     size = torch.maximum(oz.abs(), torch.full_like(oz, max(abs(low_z), abs(high_z))))
     close, narrow = FEW_ULP * size, FEW_ULP * torch.maximum(high, size)

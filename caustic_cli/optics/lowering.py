@@ -21,14 +21,9 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
     prepared arrays are reused."""
     system, start, (inside, outside) = tracer.system, tracer.start, tracer.media[-2:]
     element = system.elements[-1]
-    if (
-        _needs_stages(tracer)
-        or tracer.first != len(system.elements) - 1
-        or not _is_plain(element, system.pupil)
-        or tracer.sides[-1] < 0
-    ):
+    if _needs_stages(tracer) or tracer.first != len(system.elements) - 1 or not _is_plain(element, system.pupil):
         return None
-    if not _are_plain(start) or not (system.lit or tracer.first):
+    if tracer.sides[-1] < 0 or not _are_plain(start) or not (system.lit or tracer.first):
         return None
     eta = inside.index_at(start.wavelength) / outside.index_at(start.wavelength)
     if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface

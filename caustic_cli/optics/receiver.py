@@ -127,13 +127,13 @@ class Receiver:
 
     def corners(self) -> list[Vector]:
         """Its four corners in space, mm."""
-        (u, v, _), found = self.axes, []
+        (u, v, _), corners = self.axes, []
         for a in (0, self.resolution[0]):
             for b in (0, self.resolution[1]):
                 x, y = self.low[0] + a * self.pixel[0], self.low[1] + b * self.pixel[1]
                 sx, sy, sz = (m + x * p + y * q for m, p, q in zip(self.middle, u, v, strict=True))
-                found.append((sx, sy, sz))
-        return found
+                corners.append((sx, sy, sz))
+        return corners
 
     def extent(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Limits of its orthogonal projection onto `plane`: lower and upper X and Y, mm."""

@@ -194,9 +194,9 @@ class Tracer:
         receiver = Receiver.of(self.system, screen)
         for state in states:
             ray = self._land(state, receiver)
-            part, off = self.backend.splat(*ray.origin[:2], ray.power, receiver.screen, filter)
+            splat, off = self.backend.splat(*ray.origin[:2], ray.power, receiver.screen, filter)
             assert ray.leaving is not None
-            image, leaving = image + part, leaving + ray.leaving
+            image, leaving = image + splat, leaving + ray.leaving
             ray.book("off_screen", off)
             for name, value in ray.lost.items():
                 lost[name] = lost.get(name, 0.0) + (value.detach() if isinstance(value, Tensor) else value)
@@ -408,7 +408,7 @@ def render(
 def system_tracers(
     system: System, sampler: Rays, fraction: float, dtype: torch.dtype, chunk: int, requests: Requests = NO_REQUESTS
 ) -> Iterator[Tracer]:
-    """Tracers of all rays of one source, with the fraction `fraction` of the total power, at every wavelength, chunk by chunk."""
+    """Tracers of all rays of one source, with this fraction of the total power, at every wavelength, chunk by chunk."""
     lines = zip(system.light.wavelengths, system.light.fractions, strict=True) if system.light.wavelengths else [(None, 1.0)]
     for wavelength, weight in lines:
         traced = None

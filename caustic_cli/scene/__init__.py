@@ -197,8 +197,8 @@ class Scene:
             each = zip(self.by_source, self.source.fractions, strict=True)
             return tuple(
                 replace(band, weight=fraction * band.weight, member=k)
-                for k, (one, fraction) in enumerate(each)
-                for band in one.bands
+                for k, (scene_of_member, fraction) in enumerate(each)
+                for band in scene_of_member.bands
             )
         states = (0.0, 90.0) if self.light.tracked and self.light.polarisation is None else (self.light.polarisation,)
         if not (self.dispersive or self.colored):
@@ -206,9 +206,9 @@ class Scene:
                 return (Band(self),)
             return tuple(Band(replace(self, light=Light(state)), 1.0 / len(states)) for state in states)
         bands = []
-        for wavelength, part, channel in zip(self.light.wavelengths, self.light.fractions, self.light.channels, strict=True):
+        for wavelength, fraction, channel in zip(self.light.wavelengths, self.light.fractions, self.light.channels, strict=True):
             scene = self.at(wavelength) if self.dispersive else self
-            bands += [Band(replace(scene, light=Light(state)), part / len(states), channel) for state in states]
+            bands += [Band(replace(scene, light=Light(state)), fraction / len(states), channel) for state in states]
         return tuple(bands)
 
 

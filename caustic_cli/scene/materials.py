@@ -134,11 +134,11 @@ def refractive_index(name: str, wavelength: float = D_LINE) -> float:
     Raises:
         InputError: the material is unknown, or the wavelength outside the range of its formula.
     """
-    found = material(name)
-    low, high = found.range_nm
+    glass = material(name)
+    low, high = glass.range_nm
     if not low <= wavelength <= high:
         raise InputError(f"wavelength for {_BY_NAME[_plain(name)]} must be {low:g} to {high:g} nm, got {wavelength:g}")
-    return found.index(wavelength)
+    return glass.index(wavelength)
 
 
 def described() -> list[dict[str, Any]]:

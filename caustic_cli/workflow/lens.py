@@ -76,20 +76,20 @@ class Lens:
             raise InputError(f"points must lie on the aperture, x within +-{rx:g} mm and y within +-{ry:g} mm")
         u, v = (torch.from_numpy(c.ravel().copy()) for c in (x, y))
         if side == "exit":
-            found = self.field.at(self.heights, u, v)
+            surface = self.field.at(self.heights, u, v)
         elif self.scene.lens.entrance is not None:
-            found = entrance_of(self.scene.lens).at(None, u, v)
-            found[0] = found[0] + self.scene.lens.z_in
+            surface = entrance_of(self.scene.lens).at(None, u, v)
+            surface[0] = surface[0] + self.scene.lens.z_in
         else:
-            found = [torch.full_like(u, self.scene.lens.z_in), torch.zeros_like(u), torch.zeros_like(u)]
-        z, zx, zy = (c.numpy().reshape(x.shape) for c in found)
+            surface = [torch.full_like(u, self.scene.lens.z_in), torch.zeros_like(u), torch.zeros_like(u)]
+        z, zx, zy = (c.numpy().reshape(x.shape) for c in surface)
         return z, zx, zy
 
     @classmethod
     def of(cls, origin: Project | ArchivedLens, given: Mapping[str, Any] | None = None) -> Lens:
         """The lens of a project or an archive; given: path in `config.table` -> value, overriding the settings of a project."""
-        found = origin.read(given or {})
-        return cls(*found[:4], dict(found.figures), origin, *found[5:])
+        data = origin.read(given or {})
+        return cls(*data[:4], dict(data.figures), origin, *data[5:])
 
     @property
     def project(self) -> Project | None:

@@ -47,12 +47,12 @@ class CutSurface(MeasuredSurface):
     def heights_and_slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of the lowest envelope at points (N,) mm."""
         across = -1.0 if self.turned else 1.0
-        y, found = across * y, []
+        y, envelopes = across * y, []
         for one in self.envelopes:
             z, cx, cy = one(x, y)
-            found.append((z, *one.slopes(x, y, cx, cy)))
-        z, gx, gy = found[0]
-        for other in found[1:]:
+            envelopes.append((z, *one.slopes(x, y, cx, cy)))
+        z, gx, gy = envelopes[0]
+        for other in envelopes[1:]:
             lower = other[0] < z
             z, gx, gy = (np.where(lower, b, a) for a, b in zip((z, gx, gy), other, strict=True))
         return self.base + across * z, across * gx, gy

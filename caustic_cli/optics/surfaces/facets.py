@@ -95,8 +95,8 @@ class FacetSurface(MeasuredSurface):
         at = (self.points[:-1, :-1, :2] + self.points[1:, :-1, :2] + self.points[:-1, 1:, :2] + self.points[1:, 1:, :2]) / 4.0
         aside = 0.01 * (self.points[1:, 1:, :2] - self.points[:-1, :-1, :2])  # on both sides of either diagonal
         inside = [(at + [[sx, sy]] * aside).reshape((nx - 1) * (ny - 1), 2) for sx, sy in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-        found = [type(self)(self.points).heights_and_slopes(*p.T)[1:] for p in inside]
-        most = [max(float(np.abs(slopes[k]).max()) for slopes in found) for k in (0, 1)]
+        slopes_inside = [type(self)(self.points).heights_and_slopes(*p.T)[1:] for p in inside]
+        most = [max(float(np.abs(slopes[k]).max()) for slopes in slopes_inside) for k in (0, 1)]
         if self.normals is not None:
             own = [float(np.abs(self.normals[..., k] / self.normals[..., 2]).max()) for k in (0, 1)]
             most = [max(a, b) for a, b in zip(most, own, strict=True)]

@@ -98,7 +98,7 @@ class Source:
     @property
     def powers(self) -> tuple[float, ...]:
         """Power of each position, W; of a distant source its whole power."""
-        return (self.power,) if self.distant else tuple(self.power * float(part) for part in self.points()[1])
+        return (self.power,) if self.distant else tuple(self.power * float(fraction) for fraction in self.points()[1])
 
     @property
     def extent(self) -> tuple[float, float]:

@@ -66,10 +66,10 @@ class Distribution:
         """I(theta) at angles, rad."""
         return np.interp(angle, np.radians(self.angles), self.values, right=0.0)
 
-    def angle_of(self, part: np.ndarray, cone: float) -> np.ndarray:
-        """Inverse of the cumulative flux: angles, rad, that enclose the fractions `part`, in [0, 1], of the flux into a cone."""
+    def angle_of(self, fraction: np.ndarray, cone: float) -> np.ndarray:
+        """Inverse of the cumulative flux: angles, rad, that enclose fractions, in [0, 1], of the flux into a cone."""
         angles, values, sums = _table(self, cone)
-        wanted = np.clip(part, 0.0, 1.0) * sums[-1]
+        wanted = np.clip(fraction, 0.0, 1.0) * sums[-1]
         k = np.clip(np.searchsorted(sums, wanted, side="right") - 1, 0, len(angles) - 2)
         rest, first, slope = wanted - sums[k], angles[k], (np.diff(values) / np.diff(angles))[k]
         low, high = np.zeros_like(rest), np.diff(angles)[k]

@@ -87,10 +87,10 @@ class RaySet:
     @cached_property
     def digest(self) -> str:
         """sha256 of the rays, whatever the format of their file."""
-        found = hashlib.sha256()
+        digest = hashlib.sha256()
         for values in (self.positions, self.directions, self.flux, self.wavelengths):
-            found.update(b"" if values is None else np.ascontiguousarray(values, "<f8").tobytes())
-        return found.hexdigest()
+            digest.update(b"" if values is None else np.ascontiguousarray(values, "<f8").tobytes())
+        return digest.hexdigest()
 
     def batch(self, k: int, of: int) -> RaySet:
         """The k-th batch of a fixed random partition of the rays into `of` sets; all rays where there are too few."""
@@ -107,10 +107,10 @@ class RaySet:
         Raises:
             InputError: there is none.
         """
-        found = np.where(self.directions[:, 2] > 0, self.flux, 0.0)
-        if not found.any():
+        flux = np.where(self.directions[:, 2] > 0, self.flux, 0.0)
+        if not flux.any():
             raise InputError("has no ray that carries light towards +z, the direction of emission here")
-        return found
+        return flux
 
     @cached_property
     def nearest(self) -> float:
@@ -148,11 +148,11 @@ class RaySet:
         lit = self.forward > 0
         p, d, c = self.positions[lit], self.directions[lit], self.focus
         w = self.forward[lit] * d[:, 2] ** 4
-        found = []
+        sizes = []
         for k in (0, 1):
             off = p[:, k] + (c[2] - p[:, 2]) * d[:, k] / d[:, 2] - c[k]
-            found.append(2.0 * float(np.sqrt(w @ (off * off) / w.sum())))
-        return found[0], found[1]
+            sizes.append(2.0 * float(np.sqrt(w @ (off * off) / w.sum())))
+        return sizes[0], sizes[1]
 
 
 def _refuse(wrong: np.ndarray, what: str) -> None:

@@ -41,9 +41,9 @@ class Attached(str):
     @classmethod
     def of(cls, name: str, data: bytes, content: Any, suffix: str = "") -> Attached:
         """An attached file of that name."""
-        found = cls(name)
-        found.data, found.content, found.suffix = data, content, suffix
-        return found
+        attached = cls(name)
+        attached.data, attached.content, attached.suffix = data, content, suffix
+        return attached
 
     def named(self, name: str) -> Attached:
         """The same file under another name."""
@@ -121,7 +121,7 @@ def single_position(table: Table, name: str) -> tuple[float, float, float]:
     Raises:
         InputError: there are several.
     """
-    found = positions(table)
-    if len(found) != 1 and "angle" not in table:
+    places = positions(table)
+    if len(places) != 1 and "angle" not in table:
         raise InputError(f"⟨source.position⟩ of a {name} is its centre, one [x, y, z], got {len(found)}")
-    return found[0]
+    return places[0]

@@ -75,9 +75,9 @@ class Several(Source):
         """Positions of all near members, weighted by power."""
         if self.distant:
             return super().points()
-        places, parts = zip(*(member.points() for member in self._near), strict=True)
-        parts = np.concatenate([member.power * p for member, p in zip(self._near, parts, strict=True)])
-        return np.concatenate(places), parts / parts.sum()
+        places, fractions = zip(*(member.points() for member in self._near), strict=True)
+        fractions = np.concatenate([member.power * p for member, p in zip(self._near, fractions, strict=True)])
+        return np.concatenate(places), fractions / fractions.sum()
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -162,5 +162,5 @@ def light_of_all(section: Table, color: bool = False) -> Light:
         return lights[0]
     powers = [table["power"] for table in (section, *section["also"])]
     wavelengths = tuple(w for light in lights for w in light.wavelengths)
-    weights = tuple(power * part for power, light in zip(powers, lights, strict=True) for part in light.fractions)
+    weights = tuple(power * fraction for power, light in zip(powers, lights, strict=True) for fraction in light.fractions)
     return replace(lights[0], wavelengths=wavelengths, weights=weights)
