@@ -140,18 +140,14 @@ class Problem:
         return self._room[control]
 
     def _bounds(self, k: int) -> tuple[Tensor, Tensor]:
-        lens, field = self.scene.lens, self.field(k)
-        low, high = lens.height_bounds(*(c.numpy() for c in field.control_xy()))
-        for scene in self.scenes:
-            screen = scene.screen
-            before, behind = reach(screen)
-            if lens.mirror and low.min() <= screen.z + behind:
+        lens, side = self.scene.lens, self.scene.lens.interaction.side
+        low, high = lens.height_bounds(*(c.numpy() for c in self.field(k).control_xy()))
+        top = side * max((side * z).max() for z in (low, high))  # towards the screen
+        for screen in (scene.screen for scene in self.scenes):
+            if side * (screen.z - top) <= max(-side * bound for bound in reach(screen)):
                 raise InputError(
-                    f"⟨screen.z⟩ must lie before the mirror, whose surface may reach {low.min():.4g} mm, got {screen.z:g} mm"
-                )
-            if not lens.mirror and high.max() >= screen.z + before:
-                raise InputError(
-                    f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm, got {screen.z:g} mm"
+                    f"⟨screen.z⟩ must lie {lens.interaction.beyond} the {lens.kind}, whose surface may reach {top:.4g} mm,"
+                    f" got {screen.z:g} mm"
                 )
         return torch.from_numpy(low), torch.from_numpy(high)
 
