@@ -59,6 +59,7 @@ def complete(
     s = _in_colour(s) if s.target.color else s
     over = Ranges.parse(s.design.over)
     s = s.changed(screen=_placed(s, by, aspect, "z" in given.get("screen", {}), over))
+    _check_sizes(s)
     check("target.flip", s.target.flip)
     check("target.encoding", s.target.encoding)
     s = s.changed(source=complete_source(s.source, s.lens, [stage.get("source", "") for stage in s.design.stages]))
@@ -106,13 +107,17 @@ def _placed(s: Settings, by: Parameters, aspect: float, placed: bool, over: Rang
             screen = screen.changed(resolution=by.resolution)
     if over and "throw" in over.keys:
         screen = screen.changed(z=middle_distance(over, screen.z, side, by.throw is not None or placed))
+    return screen
+
+
+def _check_sizes(s: Settings) -> None:
+    """Check the sizes that are given, and the distance of the screen."""
     check("lens.size", s.lens.size)
-    if check("screen.z", screen.z) == 0:
+    if check("screen.z", s.screen.z) == 0:
         raise InputError("⟨screen.z⟩ must lie behind the lens, or before a mirror, got 0 mm")
-    for section in (screen, s.target):
+    for section in (s.screen, s.target):
         if "size" in section:
             check(f"{section.section}.size", section["size"])
-    return screen
 
 
 def complete_source(

@@ -3,6 +3,11 @@ here."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene import sources
 from caustic_cli.scene.aperture import Aperture, CircularAperture, Pupil
 from caustic_cli.scene.elements import (
     BESIDE_ELEMENTS,
@@ -15,8 +20,12 @@ from caustic_cli.scene.elements import (
 from caustic_cli.scene.freeform import FreeForm, SecondTarget
 from caustic_cli.scene.lens import Lens, Offset
 from caustic_cli.scene.light import Light
+from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import Screen
-from caustic_cli.scene.sources import Disc, PlaneWave, Points, Source
+from caustic_cli.scene.sources import PlaneWave, Source
+
+if TYPE_CHECKING:
+    from caustic_cli.scene.sources import Disc, Points
 
 __all__ = [
     "COMPONENTS",
@@ -38,11 +47,6 @@ __all__ = [
     "SecondTarget",
     "Source",
 ]
-
-from dataclasses import dataclass, field, replace
-
-from caustic_cli.errors import InputError
-from caustic_cli.scene.materials import refractive_index
 
 
 @dataclass(frozen=True)
@@ -208,3 +212,8 @@ class Scene:
             scene = self.at(wavelength) if self.dispersive else self
             bands += [Band(replace(scene, light=Light(state)), part / len(states), channel) for state in states]
         return tuple(bands)
+
+
+def __getattr__(name: str) -> Any:
+    """The other sources, which are loaded when they are asked for."""
+    return getattr(sources, name)
