@@ -252,7 +252,7 @@ def test_surface_met_by_rays(side, steep, launched):
     dx, dy, dz = directions(12, count)
     inputs = [heights, x, y, 5.0 - side * (20.0 + numbers(13, count).abs()), dx, dy, side * dz]
     by = [lambda h, *r, one=one: one.intersect_spline(field, h, r[:3], r[3:], side) for one in (Cuda(), Torch())]
-    found = [b(*inputs).found for b in by]
+    found = [b(*inputs).valid for b in by]
     assert torch.equal(*found) and 5 < int(found[0].sum()) < count
     if steep:
         slopes = field.slope_bounds(heights)
@@ -267,7 +267,7 @@ def test_surface_met_by_no_ray():
     rays = [torch.zeros(3, dtype=torch.float64) for _ in range(3)]
     away = [torch.zeros(3, dtype=torch.float64)] * 2 + [-torch.ones(3, dtype=torch.float64)]
     by = [lambda h, one=one: one.intersect_fixed(field, rays, away)(h) for one in (Cuda(), Torch())]
-    assert not by[0](heights).found.any()
+    assert not by[0](heights).valid.any()
     assert all(float(g.abs().max()) == 0.0 for g in gradients(by[0], (heights,)))
 
 
@@ -276,7 +276,7 @@ def test_surface_at_nothing_and_met_by_nothing():
     none = torch.zeros(0, dtype=torch.float64)
     leaf = heights.clone().requires_grad_()
     assert all(t.shape == (0,) for t in Cuda().spline_at(field, leaf, none, none))
-    assert Cuda().intersect_spline(field, leaf, (none, none, none), (none, none, none), 1.0).found.shape == (0,)
+    assert Cuda().intersect_spline(field, leaf, (none, none, none), (none, none, none), 1.0).valid.shape == (0,)
     image, outside = Cuda().splat(none, none, none, SCREEN, FILTERS[1])
     assert float(image.abs().sum()) == float(outside) == 0.0
 

@@ -71,7 +71,7 @@ NONE = ((), ())
 SCENES: dict[str, Scene] = {
     "mirror": replace(PLAIN, lens=replace(LENS, mirror=True), screen=replace(PLAIN.screen, z=-100.0)),
     "gradient index": lens(gradient=Gradient("axial", (0.01,))),
-    "two sides": replace(lens(entrance=FRONT), second=SecondTarget()),
+    "two sides": replace(lens(entrance=FRONT), second_target=SecondTarget()),
     "designed entrance": lens(entrance=FRONT),
     "other elements": replace(PLAIN, elements=(Component(30.0, (20.0, 20.0)),)),
     "lenslet array": lens(array=(2, 1), control=(11, 8)),

@@ -28,7 +28,7 @@ picture = torch.exp(-(((x * x + y * y).sqrt() - 0.5) / 0.15) ** 2)
 lens = Lens((10.0, 10.0), control=(12, 12), offset=Offset.for_magnification((2.5, 2.5), 1.5, 300.0, 5.0))
 stages = [Stage((12, 12), 10_000, rendering=LossImage(blur=blur, apron=2), iterations=15) for blur in (2.0, 0.0)]
 designer = Designer(Problem(Scene(PlaneWave(), lens, screen), picture, stages, Options()))
-losses = [row[2] for row in designer.run(designer.begin()).history]
+losses = [row[2] for row in designer.run(designer.initial_state()).history]
 print(losses[0], losses[-1], *(name for name in sys.modules if name.startswith("caustic_cli") or name == "numba"))
 """
 #: Modules of the core beside those of scene and optics: of the table of settings, the inverse problem, and messages.

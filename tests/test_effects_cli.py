@@ -154,7 +154,7 @@ def test_an_archive_keeps_glass_and_light(capfd):
         run(capfd, "render", source, "--rays", "4000", "--npy", image)
     assert (np.load("a.npy") == np.load("b.npy")).all()
     scene, light = open_archive("lens.npz")[0], workflow.Project.open("blob.caustic").scene().light
-    assert scene.light.parts == light.parts and scene.light.wavelengths == light.wavelengths
+    assert scene.light.fractions == light.fractions and scene.light.wavelengths == light.wavelengths
 
 
 def test_dispersion_of_a_glass_and_its_range(capfd):
@@ -298,8 +298,8 @@ def test_wavelengths_leave_a_coloured_picture_its_balance(capfd):
     run(capfd, "design", "rgb.png", "--color", "--wavelengths", "620,540,460", *TINY, "-o", "own.caustic")
     run(capfd, "design", "rgb.png", "--color", "--wavelengths", "620:1,540:1,460:1", *TINY, "-o", "even.caustic")
     own, even = (workflow.Project.open(f"{name}.caustic").scene().light for name in ("own", "even"))
-    red, green, blue = own.parts
-    assert red == pytest.approx(blue, rel=0.2) and green < 0.7 * red and even.parts == (1 / 3,) * 3
+    red, green, blue = own.fractions
+    assert red == pytest.approx(blue, rel=0.2) and green < 0.7 * red and even.fractions == (1 / 3,) * 3
 
 
 def test_a_configuration_says_how_the_picture_is_read(capfd):

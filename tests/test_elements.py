@@ -67,7 +67,7 @@ def paraxial_rays(scene: Scene, x: float, tangent: float) -> tuple[float, float]
     one = torch.ones(1, dtype=torch.float64)
     system = System.of(scene, FIELD)
     length = math.hypot(1.0, tangent)
-    start = scene.before[0].z if scene.before else LENS.z_in
+    start = scene.in_front[0].z if scene.in_front else LENS.z_in
     rays = RayState((x * one, 0.0 * one, start * one), (tangent / length * one, 0.0 * one, one / length), one)
     (state,) = Tracer(system, rays)({EXIT: torch.full((35, 35), 5.0, dtype=torch.float64)})
     dx, _, dz = state.full(state.direction)

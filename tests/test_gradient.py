@@ -229,7 +229,7 @@ def test_what_is_no_field_is_refused():
     with pytest.raises(InputError, match=r"0\.5"):
         Selfoc(1.5, 0.3).extremes((4.0, 4.0), 1.0)
     with pytest.raises(InputError, match="in front of"):
-        System((PlaneWave(),), block(None, 4.0), before=GradientMedium(1.5, gradient=Axial(1.5, (0.1,))))
+        System((PlaneWave(),), block(None, 4.0), object_space=GradientMedium(1.5, gradient=Axial(1.5, (0.1,))))
 
 
 def test_rays_that_do_not_converge_are_refused():

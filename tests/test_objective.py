@@ -203,7 +203,7 @@ def test_three_wavelengths_keep_their_graphs(kind, fresnel, kernels):
     assert [band.weight for band in scene.bands] == pytest.approx([0.25, 0.5, 0.25])
     assert len({band.scene.lens.index for band in scene.bands}) == 3
     made = Objective(scene, FIELD, sampler, disc(), "rms-light", LossImage(COSINE), dtype=torch.float64)
-    assert made.whole == (kernels == "fused") and len(made.kept) == 3
+    assert made.keeps_graphs == (kernels == "fused") and len(made.kept) == 3
 
     class Linear(torch.nn.Module):
         """A loss whose derivative by the image is the same everywhere, so that those of wavelengths add up."""
@@ -215,7 +215,7 @@ def test_three_wavelengths_keep_their_graphs(kind, fresnel, kernels):
 
     def gradient(of: Scene) -> torch.Tensor:
         one = Objective(of, FIELD, sampler, disc(), "rms-light", LossImage(COSINE), dtype=torch.float64)
-        assert one.whole
+        assert one.keeps_graphs
         one.loss = Linear()
         return one(z).gradient
 

@@ -208,7 +208,7 @@ def test_draws_are_stratified_repeatable_and_new_every_iteration():
 
 def test_a_few_iterations_help_all_over_the_range():
     made = designer()
-    state = made.begin()
+    state = made.initial_state()
     done = made.run(state, iterations=30)
     losses = [row[2] for row in done.history]
     assert np.mean(losses[-5:]) < 0.8 * losses[0]

@@ -74,7 +74,7 @@ def test_every_path_says_the_same_of_odd_systems(name, kind, monkeypatch):
     """Fused or by stages, compiled or plain, of rays in rows and columns or scattered; nothing is made or lost on the way."""
     source, elements, leaves = ODD[name]
     system, images = System((source,), elements, (SCREEN,)), []
-    heights = {"back": bumpy(0.3 if "denser" in name or "same" in name else 0.05)} if "back" in system.free else {}
+    heights = {"back": bumpy(0.3 if "denser" in name or "same" in name else 0.05)} if "back" in system.shapes else {}
     for kernels in ("", "torch"):
         monkeypatch.setenv("CAUSTIC_KERNELS", kernels)
         for stages in (False, True):

@@ -46,7 +46,7 @@ def designed(tmp_path_factory):
     (folder / "c.toml").write_text(CONFIG)
     with pytest.MonkeyPatch.context() as patch:
         small_designs(patch, 10_000)
-        begun = workflow.begin(
+        begun = workflow.prepare(
             folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=Reporter(quiet=True)
         )
         workflow.design(begun, "cpu", Reporter(quiet=True), 0.0)

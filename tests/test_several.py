@@ -138,7 +138,7 @@ def test_settings_go_round():
     assert again == settings.tables_of(full)
     source, light = settings.build_source(full.source), settings.build_light(full)
     assert [m.kind for m in source.members] == ["point", "disc"] and source.fractions == (0.75, 0.25)
-    assert light.wavelengths == (620.0, 450.0, 500.0) and light.parts == pytest.approx((0.75, 0.125, 0.125))
+    assert light.wavelengths == (620.0, 450.0, 500.0) and light.fractions == pytest.approx((0.75, 0.125, 0.125))
     assert full.design.start == "transport"  # both stand in the same place
     one = complete(settings.parse("[[source]]\ntype = 'point'\n", "a"), 1.0)
     assert len(settings.build_source(one.source).members) == 1 and "[source]" in settings.dump(one)

@@ -294,7 +294,7 @@ def test_a_design_in_time_slices_is_the_uninterrupted_design(small):
         entry = run_of(small, k)
         while entry.iterations < 6:
             entry.advance(0.0)  # one iteration a turn
-        whole = entry.designer.run(entry.designer.begin(), iterations=6)
+        whole = entry.designer.run(entry.designer.initial_state(), iterations=6)
         assert bool((whole.heights == entry.heights).all())
         assert len(entry.steps) == 6 and min(entry.steps) > 0 and sum(entry.steps) == pytest.approx(entry.seconds)
         assert entry.loss == whole.history[-1][2] * 576 and not entry.done

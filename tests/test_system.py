@@ -361,7 +361,7 @@ def test_a_sphere_by_its_closed_form_is_the_general_search():
             d = [*lean, side * torch.sqrt(1 - lean[0] ** 2 - lean[1] ** 2)]
             sphere = Sphere(radius, reach=9.0)
             closed, searched = sphere.intersect(None, o, d, side), super(Sphere, sphere).intersect(None, o, d, side)
-            both = closed.found & searched.found
+            both = closed.valid & searched.valid
             assert int(both.sum()) > 150
             for a, b in zip(closed[:3], searched[:3], strict=True):
                 torch.testing.assert_close(a[both], b[both], rtol=0, atol=1e-12)
@@ -450,5 +450,5 @@ def test_an_absorbing_medium_in_front_of_the_pupil(source):
         Element("out", Plane(), Aperture((6.0, 6.0)), pose=Pose((0.0, 0.0, 4.0))),
     )
     clear = System((source,), elements, (Screen((20.0, 20.0), 100.0),))
-    (without,), (image,) = (render(s, {}, 1000) for s in (clear, replace(clear, before=Medium(1.0, 0.1))))
+    (without,), (image,) = (render(s, {}, 1000) for s in (clear, replace(clear, object_space=Medium(1.0, 0.1))))
     assert torch.equal(image.image, without.image) and image.lost == without.lost

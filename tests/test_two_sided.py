@@ -55,7 +55,7 @@ def judged(scene, field, nets, second):
 @pytest.mark.parametrize("focus", [None, (0.5, -0.5, 800.0)])
 @pytest.mark.parametrize("source", [PlaneWave(), Points(((0.0, 0.0, -80.0),))])
 def test_first_sides_send_light_to_the_picture_and_on(focus, source):
-    scene = Scene(source, LENS, NEAR, second=SecondTarget(focus=focus))
+    scene = Scene(source, LENS, NEAR, second_target=SecondTarget(focus=focus))
     field = HeightField.of(LENS)
     found = judged(scene, field, first_sides(scene, ONE, None, field, 128), None)
     assert found["relative_rms"] < 0.25 and found["angle_rms_mrad"] < 2.0
@@ -63,7 +63,7 @@ def test_first_sides_send_light_to_the_picture_and_on(focus, source):
 
 
 def test_first_sides_of_two_pictures():
-    scene = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget(FAR))
+    scene = Scene(PlaneWave(), LENS, NEAR, second_target=SecondTarget(FAR))
     field = HeightField.of(LENS)
     found = judged(scene, field, first_sides(scene, ONE, TWO, field, 128), TWO)
     assert found["relative_rms"] < 0.35 and found["second_relative_rms"] < 0.7
@@ -71,7 +71,7 @@ def test_first_sides_of_two_pictures():
 
 def test_a_loss_of_zero_has_no_gradient():
     """Collimated light through a plate has its own image as picture, and stays collimated: the gradient is zero, not NaN."""
-    scene, field = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget()), HeightField.of(LENS)
+    scene, field = Scene(PlaneWave(), LENS, NEAR, second_target=SecondTarget()), HeightField.of(LENS)
     plate = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, LENS.offset.thickness).double()])
 
     def evaluation(target: torch.Tensor):
@@ -87,7 +87,7 @@ def test_a_loss_of_zero_has_no_gradient():
 @pytest.mark.parametrize("loss", ["rms", "uniformity"])
 def test_losses_of_the_images_alone_have_gradients_of_both_sides(loss):
     """They do not depend on what leaves the lens."""
-    scene = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget(FAR))
+    scene = Scene(PlaneWave(), LENS, NEAR, second_target=SecondTarget(FAR))
     field, targets = HeightField.of(LENS), (torch.from_numpy(ONE), torch.from_numpy(TWO))
     objective = TwoSidedObjective(
         scene, field, rays_of(scene, "grid", 10_000), targets, loss, LossImage(Filter("cosine", (5, 5)), apron=6)
@@ -99,7 +99,7 @@ def test_losses_of_the_images_alone_have_gradients_of_both_sides(loss):
 @pytest.mark.parametrize("second", [SecondTarget(), SecondTarget(FAR), SecondTarget(focus=(1.0, 2.0, 200.0))])
 def test_the_loss_has_the_gradients_of_both_sides(second):
     """Against central differences along random directions, each side's own and both."""
-    scene, generator = Scene(PlaneWave(), LENS, NEAR, second=second), torch.Generator().manual_seed(1)
+    scene, generator = Scene(PlaneWave(), LENS, NEAR, second_target=second), torch.Generator().manual_seed(1)
     field = HeightField.of(LENS)
     x, y = (c / 5.0 for c in field.control_xy())
     nets = torch.stack(
@@ -129,7 +129,7 @@ def test_the_loss_has_the_gradients_of_both_sides(second):
 
 
 def test_a_designed_entrance_traces_as_the_free_one():
-    scene = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget())
+    scene = Scene(PlaneWave(), LENS, NEAR, second_target=SecondTarget())
     field = HeightField.of(LENS)
     nets = first_sides(scene, ONE, None, field, 64)
     (free,) = render(System.of(scene, field), {ENTRANCE: nets[0], EXIT: nets[1]}, 40_000, kind="grid")

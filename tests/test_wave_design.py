@@ -93,7 +93,7 @@ def test_gradient_of_the_loss(source, how):
     difference = (made(moved + step * along).loss - made(moved - step * along).loss) / (2 * step)
     assert float((found.gradient * along).sum()) == pytest.approx(difference, rel=2e-5)
     assert 0.1 < found.on_screen < 1.0
-    made.whole = not made.whole
+    made.keeps_graphs = not made.keeps_graphs
     again = made(moved)
     assert again.loss == pytest.approx(found.loss, rel=1e-12)
     assert torch.allclose(again.gradient, found.gradient, rtol=1e-9, atol=1e-12 * float(found.gradient.abs().max()))

@@ -156,7 +156,7 @@ def complete_screen(screen: ScreenSettings, target: TargetSettings, by: Paramete
 
 def complete_lens(s: Settings, source: Source) -> LensSettings:
     """The lens with its base surface, which spreads the light over the picture, and room for the heights."""
-    index, kind, free = index_of(s.lens), kind_of(s), "thickness" not in s.lens
+    index, kind, adaptable = index_of(s.lens), kind_of(s), "thickness" not in s.lens
     check("lens.index", index)
     lens = kind.blank(s.lens, s.screen, index)
     lens = lens.filled(index=index) if lens.glass is None else lens.filled(wavelength=lens.wavelength)
@@ -175,7 +175,7 @@ def complete_lens(s: Settings, source: Source) -> LensSettings:
         radius = Offset.for_magnification((across, along), -1.0 if lens.mirror else index, z, lens.thickness, vergence).radius
         least = STEEPEST * math.hypot(*lens.size) / 2.0  # an oblong picture or a near source may ask for a smaller radius
         lens = lens.changed(radius=[math.copysign(max(abs(r), least), r) for r in radius])
-    return lens.changed(thickness=lens.thickness + _missing_room(lens)) if free and kind.adapts else lens
+    return lens.changed(thickness=lens.thickness + _missing_room(lens)) if adaptable and kind.adapts else lens
 
 
 def _missing_room(lens: LensSettings) -> float:

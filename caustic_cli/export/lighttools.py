@@ -168,7 +168,7 @@ def _light(light: Light) -> dict[str, np.ndarray]:
     1, if these are those of a coloured picture; source_polarisation, degrees from +x."""
     found = {} if light.unit == "W" else {"source_power_unit": np.array(light.unit)}
     if light.wavelengths:
-        found |= {"source_wavelengths": _reals(light.wavelengths), "source_weights": _reals(light.parts)}
+        found |= {"source_wavelengths": _reals(light.wavelengths), "source_weights": _reals(light.fractions)}
     if light.color:
         found["source_color"] = np.array(1, np.int64)
     return found if light.polarisation is None else found | {"source_polarisation": _reals(light.polarisation)}

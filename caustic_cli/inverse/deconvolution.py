@@ -47,17 +47,17 @@ LEAST_REACH = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Deconvolved:
-    """Result of a deconvolution.
+    """Result of a deconvolution."""
 
-    light: (n + 2 a, m + 2 b), relative irradiance on the pixels of the screen and of a margin around it; beside: that margin (a,
-    b), pixels; error: relative RMS between the picture and the best solution found, blurred, each over its own mean on the screen;
-    bound: lower bound of that error for any light; kept: fraction of `light` that the blur leaves on the screen.
-    """
-
+    #: (n + 2 a, m + 2 b), relative irradiance on the pixels of the screen and of a margin around it.
     light: np.ndarray
+    #: That margin (a, b), pixels.
     beside: tuple[int, int]
+    #: Relative RMS between the picture and the best solution found, blurred, each over its own mean on the screen.
     error: float
+    #: Lower bound of that error for any light.
     bound: float
+    #: Fraction of `light` that the blur leaves on the screen.
     kept: float
 
 

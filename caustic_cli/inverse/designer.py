@@ -90,19 +90,19 @@ class Designer:
         """
         if heights is None:
             return None
-        whole = self.problem.whole(heights)
+        surfaces = self.problem.all_surfaces(heights)
         return InitialHeights(
-            self.problem.feasible(0, whole),
-            self.problem.feasible(0, whole, rounded=False) if self.options.limits.min_radius > 0 else None,
+            self.problem.feasible(0, surfaces),
+            self.problem.feasible(0, surfaces, rounded=False) if self.options.limits.min_radius > 0 else None,
         )
 
-    def begin(self, heights: Tensor | None = None, unrounded: Tensor | None = None) -> State:
+    def initial_state(self, heights: Tensor | None = None, unrounded: Tensor | None = None) -> State:
         """The initial state: that of the parametrisation, or from `initial_heights`."""
         module = self.problem.parametrised(0, heights)
         first, free = module().detach(), self.options.parametrisation.free  # free heights are the parameters themselves
         return State(first, parameters={} if free else module.state_dict(), start=first, unrounded=unrounded)
 
-    def begun(self, state: State, rounded: bool = True) -> Tensor:
+    def initial_surface(self, state: State, rounded: bool = True) -> Tensor:
         """The initial surface on the control net of the current stage (n, m), mm; or the `unrounded` one."""
         heights = state.start if rounded else state.unrounded
         assert heights is not None
@@ -130,8 +130,10 @@ class Designer:
         start = state.heights if self.options.parametrisation.free else None
         module = self.problem.parametrised(state.stage, start, loaded=bool(state.parameters))
         if state.parameters:
-            own, held = ({k: tuple(v.shape) for k, v in part.items()} for part in (module.state_dict(), state.parameters))
-            if own != held:
+            expected, loaded = (
+                {k: tuple(v.shape) for k, v in parameters.items()} for parameters in (module.state_dict(), state.parameters)
+            )
+            if expected != loaded:
                 raise InputError(UNFIT)
             module.load_state_dict(state.parameters)
         return module
@@ -158,19 +160,19 @@ class Designer:
         Raises:
             CausticError: no light reaches the screen at the beginning of a stage, or the loss there is not finite.
         """
-        began, before = time.monotonic(), state.seconds
+        started, earlier = time.monotonic(), state.seconds
         limit = iterations or sum(s.iterations for s in self.stages)
         last = len(self.stages) - 1
         costs = [s.cost for s in self.stages]
         ahead = sum(costs[state.stage :])
         state.reason = ""
         for k in range(state.stage, last + 1):
-            deadline = began + time_limit
+            deadline = started + time_limit
             if k < last and ahead and math.isfinite(time_limit):
-                deadline = began + time_limit * sum(costs[state.stage : k + 1]) / ahead
+                deadline = started + time_limit * sum(costs[state.stage : k + 1]) / ahead
             end = partial(self._end, state, k, limit, deadline, stop)
             try:
-                done = self._stage(state, k, end, on_iteration, notice, began - before)
+                done = self._stage(state, k, end, on_iteration, notice, started - earlier)
             except Skipped as skipped:
                 notice(f"stage {k + 1}: {skipped}")
                 state.reason, done = skipped.reason, True
@@ -239,7 +241,7 @@ class Designer:
 
     def objective(self, k: int, heights: Heights) -> LossOfHeights:
         """The objective of stage k, for heights near those of the parametrisation."""
-        return self.problem.objective(k, heights.begun())
+        return self.problem.objective(k, heights.initial_heights())
 
     def _next(self, state: State, k: int) -> State:
         """The state at the beginning of stage k: the same surface on its control net."""
@@ -249,11 +251,11 @@ class Designer:
             raise InputError("⟨design.stages.control⟩ cannot change between stages of a network")
         return replace(state, stage=k, iteration=0, parameters={}, optimizer={}, heights=self._carried(state.heights, k - 1, k))
 
-    def _carried(self, heights: Tensor, before: int, after: int) -> Tensor:
+    def _carried(self, heights: Tensor, source: int, destination: int) -> Tensor:
         """The same surface on the control net of another stage."""
-        if self.stages[before].control == self.stages[after].control:
+        if self.stages[source].control == self.stages[destination].control:
             return heights
-        tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(before).spaces, self.field(after).spaces, strict=True))
+        tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(source).spaces, self.field(destination).spaces, strict=True))
         return tu @ heights @ tv.T
 
     @staticmethod

@@ -66,14 +66,13 @@ INSIDE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class GradientIndexDesign:
-    """A designed gradient-index plate.
+    """A designed gradient-index plate."""
 
-    index: the designed field; start: the initial one; history: loss, in units of eq. 5.2.1, and fraction of the light on the screen
-    after each iteration.
-    """
-
+    #: The designed field.
     index: SplineIndex
+    #: The initial one.
     start: SplineIndex
+    #: Loss, in units of eq. 5.2.1, and fraction of the light on the screen after each iteration.
     history: tuple[tuple[float, float], ...]
 
 

@@ -54,13 +54,13 @@ def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
     Raises:
         InputError: the source lies behind the entrance.
     """
-    light, directions = (_traced if scene.before else _direct)(scene, x, y, z)
+    light, directions = (_traced if scene.in_front else _direct)(scene, x, y, z)
     return light * _part_within(scene.lens.opening, x, y), directions
 
 
 def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, tuple | None]:
     """The same in air on the plane of the entrance."""
-    air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", entrance=None), second=None)
+    air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", entrance=None), second_target=None)
     return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
 
 
@@ -69,7 +69,7 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     pupil, lens, whole = scene.pupil, scene.lens, System.of(without_freeforms(scene))
     names = [e.name for e in whole.elements]
     system = without_apertures(whole, 0, names.index(ENTRANCE) + 1)
-    first = scene.before[0].extent[0]
+    first = scene.in_front[0].extent[0]
 
     def arrive(at: np.ndarray, z: np.ndarray):
         """Intersections with the heights z of rays from points (2, N) of the pupil, their directions in the glass, their points on

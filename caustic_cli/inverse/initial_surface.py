@@ -98,7 +98,7 @@ class _Grid:
     def solved(self, light: np.ndarray, directions, mean: float, potential: np.ndarray | None = None, **options) -> MappedSurface:
         """The surface of this mean height that maps the light to the picture; potential: initial one at these corners, mm^2."""
         scene = self.scene
-        if not light.all() and (scene.before or not scene.source.distant):
+        if not light.all() and (scene.in_front or not scene.source.distant):
             options["darkest"] = DARKEST
         projection = self.projection(mean)
         target, half, centre = (
@@ -231,7 +231,7 @@ def first_surface(
     z = grid.offset
     if scene.source.distant or lens.mirror or scene.elements:
         found = None
-        for _ in range(1 if scene.source.distant and not scene.before else PASSES):
+        for _ in range(1 if scene.source.distant and not scene.in_front else PASSES):
             known = None if found is None else found.transport.potential
             found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), known, **options)
             z = found.heights

@@ -114,7 +114,7 @@ def first_sides(
     Raises:
         InputError: light of the picture would come from outside the exit, or cannot be refracted there.
     """
-    lens, behind, thickness = scene.lens, scene.second, scene.lens.offset.thickness
+    lens, behind, thickness = scene.lens, scene.second_target, scene.lens.offset.thickness
     assert behind is not None
     least, most = CELLS
     grid = _CellGrid.of(lens.half_size, cells or min(most, max(least, A_PIXEL * max(target.shape))))

@@ -78,14 +78,12 @@ def penalty_of(scene: Scene, field: HeightField, loss: str, limits: Limits, devi
 
 @dataclass(frozen=True)
 class SourceBlur:
-    """What the extent of the source does to the image of its points.
+    """What the extent of the source does to the image of its points."""
 
-    spread: convolution for the image of each point, with the section of the source that it represents; empty for rays of the whole
-    source.  The image is then traced on a margin from which light is spread onto screen and apron.
-    expected: fraction of the light that can be on screen and apron behind the blur.
-    """
-
+    #: Convolution for the image of each point, with the section of the source that it represents; empty for rays of the whole
+    #: source.  The image is then traced on a margin from which light is spread onto screen and apron.
     spread: Sequence[Convolution] = ()
+    #: Fraction of the light that can be on screen and apron behind the blur.
     expected: float = 1.0
 
     @property
@@ -215,7 +213,7 @@ class Objective:
         return other
 
     @property
-    def whole(self) -> bool:
+    def keeps_graphs(self) -> bool:
         """Whether the graphs of all chunks are kept: a fused kernel stores the net or the surface at its rays, a staged trace every
         ray after each stage."""
         return self.kept is not None and (sum(t.fused is None for _, t in self.kept) <= self.graphs)
@@ -232,7 +230,7 @@ class Objective:
         rank, count = ranks.rank_and_size()
         for k, sampler in enumerate(self.samplers):
             size = min(self.chunk, math.ceil(sampler.count / count)) if count > 1 else self.chunk
-            for traced in tracers(self.scene, self.field, sampler, self.dtype, size, part=(rank, count)):
+            for traced in tracers(self.scene, self.field, sampler, self.dtype, size, share=(rank, count)):
                 yield k, traced
 
     def __call__(self, heights: Tensor) -> Evaluation:
@@ -265,21 +263,21 @@ class Objective:
             heights.requires_grad_()
         leaves = list(parameters.values())
         penalty = self._penalty(parameters) if self.penalty else torch.zeros((), device=self.device)
-        sums, entering, parts = self._sums(parameters)
+        sums, entering, contributions = self._sums(parameters)
         ranks.all_reduce(*sums, entering)
         for value in sums:
             value.requires_grad_()
         seen = [self.blur.spread_out(images) for images in sums[: len(self.channels)]]
         loss = self._loss(seen, sums[len(self.channels) :], penalty, entering)
         wanted = [*sums, *leaves] if penalty.requires_grad else sums
-        found = torch.autograd.grad(loss, wanted, allow_unused=True)
-        by, direct = found[: len(sums)], found[len(sums) :] or (None,) * len(leaves)
+        derivatives = torch.autograd.grad(loss, wanted, allow_unused=True)
+        by, direct = derivatives[: len(sums)], derivatives[len(sums) :] or (None,) * len(leaves)
         gradients = [torch.zeros_like(heights) for heights in leaves]
-        for k, part in parts or ((k, self._see(traced, parameters)) for k, traced in self.kept or self._tracers()):
+        for k, contribution in contributions or ((k, self._see(traced, parameters)) for k, traced in self.kept or self._tracers()):
             # Bincount images, and the power that leaves a lens without reflections, do not depend on the heights.
             pulls = [
                 (value, pull.to(value.dtype))
-                for value, pull in zip(part, self._of_point(by, k), strict=True)
+                for value, pull in zip(contribution, self._of_point(by, k), strict=True)
                 if pull is not None and value.requires_grad
             ]
             if pulls:
@@ -296,15 +294,15 @@ class Objective:
         zero = torch.zeros(self.channels[0].shape[:-2], dtype=torch.float64, device=self.device)  # one for each colour
         sums = [zero.new_zeros(len(self.samplers), *channel.shape) for channel in self.channels]
         sums += [zero.clone() for _ in range(1 + self.further)]
-        entering, parts = zero.clone(), []
-        with torch.set_grad_enabled(self.whole):
+        entering, contributions = zero.clone(), []
+        with torch.set_grad_enabled(self.keeps_graphs):
             for k, traced in self.kept or self._tracers():
-                part = self._see(traced, parameters)
-                _add(self._of_point(sums, k), [more.detach() for more in part])
+                contribution = self._see(traced, parameters)
+                _add(self._of_point(sums, k), [more.detach() for more in contribution])
                 entering = entering + traced.entering.double()
-                if self.whole:
-                    parts.append((k, part))
-        return sums, entering, parts
+                if self.keeps_graphs:
+                    contributions.append((k, contribution))
+        return sums, entering, contributions
 
     def _of_point(self, values: Sequence[Tensor], k: int) -> list[Tensor]:
         """Of accumulated values, or their derivatives, which may be None, those of source point k."""
@@ -314,8 +312,8 @@ class Objective:
     def _see(self, traced: Tracer, parameters: Parameters) -> list[Tensor]:
         """Contribution of a chunk to the image of each channel, the power that leaves the lens, and further sums over rays."""
         channel = self.channels[0]
-        part = traced.expose(parameters, channel.screen, channel.how.filter)
-        return [channel.pooled(part.image), part.leaving]
+        exposure = traced.expose(parameters, channel.screen, channel.how.filter)
+        return [channel.pooled(exposure.image), exposure.leaving]
 
     def _loss(self, seen: list[Tensor], sums: list[Tensor], penalty: Tensor, entering: Tensor) -> Tensor:
         """The loss of the images of all channels, the power that leaves the lens, and further sums over rays."""
@@ -328,6 +326,6 @@ class Objective:
 
 def _add(values: Sequence[Tensor], more: Sequence[Tensor | None]) -> None:
     """Add to values in place, None for zero."""
-    for value, part in zip(values, more, strict=True):
-        if part is not None:
-            value += part
+    for value, summand in zip(values, more, strict=True):
+        if summand is not None:
+            value += summand

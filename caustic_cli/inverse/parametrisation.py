@@ -167,7 +167,7 @@ class Heights(torch.nn.Module):
     def forward(self, inputs: Tensor | None = None) -> Tensor:
         return self.low + 0.5 * (1.0 + torch.tanh(self.raw(inputs).double())) * self.span
 
-    def begun(self) -> Tensor:
+    def initial_heights(self) -> Tensor:
         """The heights (n, m), mm, at which parameters that are relative to an initial surface are zero; else the current ones."""
         return self().detach()
 
@@ -182,7 +182,7 @@ class FreeHeights(Heights):
 
     Args:
         start: (n, m) initial heights, mm, or None for the middle of the range.
-        counted: parameters are relative to the initial heights, which `begun` returns.
+        counted: parameters are relative to the initial heights, which `initial_heights` returns.
     """
 
     def __init__(self, low: Tensor, high: Tensor, start: Tensor | None = None, laplacian: bool = False, counted: bool = False):
@@ -196,9 +196,9 @@ class FreeHeights(Heights):
         y = self.y if self.laplacian is None else self.laplacian(self.y)
         return y if self.start is None else self.start + y
 
-    def begun(self) -> Tensor:
+    def initial_heights(self) -> Tensor:
         if self.start is None:
-            return super().begun()
+            return super().initial_heights()
         return self.low + 0.5 * (1.0 + torch.tanh(self.start.double())) * self.span
 
 

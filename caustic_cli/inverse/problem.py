@@ -123,7 +123,7 @@ class Problem:
         """The spline spaces of stage k."""
         return HeightField.of(replace(self.scene.lens, control=self.stages[k].control))
 
-    def whole(self, heights: Tensor) -> Tensor:
+    def all_surfaces(self, heights: Tensor) -> Tensor:
         """Initial heights of all unknown surfaces on the control net of the first stage, from those of the exit (n, m), mm."""
         return heights
 
@@ -174,11 +174,11 @@ class Problem:
         same = self.stages[k].control == self.stages[k - 1].control
         return same and (not self.options.parametrisation.free or self.options.optimizer == "adam")
 
-    def objective(self, k: int, begun: Tensor) -> LossOfHeights:
-        """The loss of stage k, for heights near `begun`."""
-        return self.objective_in(self.scene, k, begun)
+    def objective(self, k: int, initial: Tensor) -> LossOfHeights:
+        """The loss of stage k, for heights near `initial`."""
+        return self.objective_in(self.scene, k, initial)
 
-    def objective_in(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
+    def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         """The same in another scene."""
         scene = self.lit(scene, k)
         return self.on_rays(scene, k, self.field(k), self.target, self.stages[k].rays)

@@ -30,13 +30,13 @@ PURPOSE = 2
 
 
 def robust_objective(
-    objective: Callable[[Scene, Tensor], LossOfHeights], scene: Scene, field: HeightField, begun: Tensor, tolerances: Tolerances
+    objective: Callable[[Scene, Tensor], LossOfHeights], scene: Scene, field: HeightField, initial: Tensor, tolerances: Tolerances
 ) -> Mixture:
     """The loss over draws as a function of the heights; see above.  Its image is that without errors.
 
     Args:
         objective: returns the loss in a scene, near heights (n, m) mm.
-        scene, field: without errors; begun: heights at the beginning of the stage, (n, m) mm.
+        scene, field: without errors; initial: heights at the beginning of the stage, (n, m) mm.
         tolerances: the errors.
 
     Raises:
@@ -49,14 +49,14 @@ def robust_objective(
     surfaces = FormErrors(field, tolerances.form, tolerances.waviness) if fits else None
     rng, count = np.random.default_rng([tolerances.seed, PURPOSE, 1]), 2 * PAIRS
     seen = 1.0 / (count + 1)
-    members = [Member(objective(scene, begun), 1.0 - WEIGHT, seen, 1.0)]
+    members = [Member(objective(scene, initial), 1.0 - WEIGHT, seen, 1.0)]
     for row in hypercube(parameters, PAIRS, tolerances.seed, PURPOSE):
         surface = surfaces.heights(rng, tolerances.surface) if surfaces else 0.0
         for sign in (-1.0, 1.0):
             values = {(p.error, p.axis): sign * float(v) for p, v in zip(parameters, row, strict=True)}
             errors = Misalignment.of(values)
             added = sign * surface + errors.thickness
-            members.append(Member(objective(errors.upright(scene), begun + added), WEIGHT / count, seen, 0.0, added=added))
+            members.append(Member(objective(errors.upright(scene), initial + added), WEIGHT / count, seen, 0.0, added=added))
     return Mixture(members, POWER)
 
 

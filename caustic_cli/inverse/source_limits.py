@@ -62,10 +62,11 @@ NET = 24
 
 @dataclass(frozen=True)
 class SourceLimits:
-    """error: lower bound of the relative RMS error of any lens, by the blur of the source; etendue: largest fraction of the light
-    on the lens that can reach the screen; each None where the source does not determine it."""
+    """Limits that the source sets to any lens; each None where it does not determine it."""
 
+    #: Lower bound of the relative RMS error of any lens, by the blur of the source.
     error: float | None
+    #: Largest fraction of the light on the lens that can reach the screen.
     etendue: float | None
 
     def sentence(self) -> str:

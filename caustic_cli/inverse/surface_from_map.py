@@ -60,25 +60,22 @@ class OutOfReach(InputError):
 
 @dataclass(frozen=True, eq=False)
 class MappedSurface:
-    """A surface that realises a transport map, and its landing points.
+    """A surface that realises a transport map, and its landing points."""
 
-    Attributes:
-        heights: z at the corners of the source cells, (n + 1, m + 1) float64, mm.
-        x, y: landing points of the rays from there, mm, with the gradient of the bicubic spline through z.
-        miss: RMS distance between landing points and targets, weighted by the source, mm.
-        shift: e, the total displacement of the picture, (2, n + 1, m + 1) mm.
-        corrections: number of outer iterations.
-        transport: the last map.
-        seconds: wall time.
-    """
-
+    #: z at the corners of the source cells, (n + 1, m + 1) float64, mm.
     heights: np.ndarray
+    #: Landing points of the rays from there, mm, with the gradient of the bicubic spline through z.
     x: np.ndarray
     y: np.ndarray
+    #: RMS distance between landing points and targets, weighted by the source, mm.
     miss: float
+    #: e, the total displacement of the picture, (2, n + 1, m + 1) mm.
     shift: np.ndarray
+    #: Number of outer iterations.
     corrections: int
+    #: The last map.
     transport: Transport
+    #: Wall time.
     seconds: float
 
 

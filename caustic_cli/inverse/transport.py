@@ -63,24 +63,21 @@ STRIP = 128  # columns of corners averaged together, which bounds the memory
 
 @dataclass(frozen=True, eq=False)
 class Transport:
-    """A transport map and the solution it derives from: `finer` evaluates it on smaller cells.
+    """A transport map and the solution it derives from: `finer` evaluates it on smaller cells."""
 
-    Attributes:
-        potential: phi at the corners of the source's cells, edges included, (n + 1, m + 1) float64, mm^2; its mean is 0.
-        x, y: the map there, mm; the exact gradient of phi.
-        error: e, before phi is smoothed.
-        sites, steps: point masses of the finest level, and Newton steps of all levels.
-        seconds: wall time.
-        solved: prices and sites, and the source cells.
-    """
-
+    #: phi at the corners of the source's cells, edges included, (n + 1, m + 1) float64, mm^2; its mean is 0.
     potential: np.ndarray
+    #: The map there, mm; the exact gradient of phi.
     x: np.ndarray
     y: np.ndarray
+    #: e, before phi is smoothed.
     error: float
+    #: Point masses of the finest level, and Newton steps of all levels.
     sites: int
     steps: int
+    #: Wall time.
     seconds: float
+    #: Prices and sites, and the source cells.
     solved: _Solved
 
     def finer(self, times: int) -> Transport:

@@ -46,10 +46,10 @@ class TwoSidedObjective(Objective):
         how: LossImage | None = None,
         **options: Any,
     ):
-        assert scene.second is not None
+        assert scene.second_target is not None
         super().__init__(scene, field, sampler, targets[0], loss, how, **options)
-        if scene.second.screen is not None:
-            self.channels.append(Channel(scene.second.screen, targets[1].to(self.device), loss, how or LossImage()))
+        if scene.second_target.screen is not None:
+            self.channels.append(Channel(scene.second_target.screen, targets[1].to(self.device), loss, how or LossImage()))
         self.further = 2 - len(self.channels)
 
     def _see(self, traced: Tracer, parameters: Parameters) -> list[Tensor]:

@@ -38,13 +38,11 @@ KEPT = 1 << 30
 @dataclass(frozen=True)
 class Contribution:
     """Light of one wavelength and one mode, a point of the source: phase (n, m) rad at h_0 in [0, 2 pi), its derivative with
-    respect to the height (n, m) rad/mm, amplitude (n, m), masks of samples on pixels, and total power.
-
-    front: shared by parts with the same rays.
-    """
+    respect to the height (n, m) rad/mm, amplitude (n, m), masks of samples on pixels, and total power."""
 
     line: Line
     mode: int
+    #: Shared by parts with the same rays.
     front: Wavefront
     phase: Tensor
     slope: Tensor
@@ -100,7 +98,7 @@ class WaveObjective:
         self.fronts = list({id(part.front): part.front for part in self.parts}.values())
         self.colours = len({line.channel for line in lines if line.channel is not None})
         n = self.imager.sampling
-        self.whole = len(self.parts) * (8 * n.samples + 16 * n.count[0] * n.count[1]) <= KEPT
+        self.keeps_graphs = len(self.parts) * (8 * n.samples + 16 * n.count[0] * n.count[1]) <= KEPT
 
     def _parts(self, lines: list[Line], parameters):
         imager, made = self.imager, {}
@@ -131,12 +129,12 @@ class WaveObjective:
         leaving = image.new_zeros(image.shape[:-2])
         by = {id(front): z.detach().to(self.dtype).requires_grad_() for front, z in zip(self.fronts, moved, strict=True)}
         seen = []
-        with torch.set_grad_enabled(self.whole):
+        with torch.set_grad_enabled(self.keeps_graphs):
             for part in self.parts:
                 found = self._image(part, by[id(part.front)])
                 self._channel(image, part)[...] += part.line.part * found.detach().double()
                 self._channel(leaving, part)[...] += part.line.part * part.power
-                seen.append(found if self.whole else None)
+                seen.append(found if self.keeps_graphs else None)
         ranks.all_reduce(image, leaving)
         image.requires_grad_()
         loss = self.loss(image, leaving, penalty)

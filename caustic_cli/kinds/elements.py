@@ -75,7 +75,7 @@ class FreeElements(SeveralSurfaces, AmongElements):
         """Heights of the initial spheres of the other designed surfaces on the control net of the first stage."""
         return [sphere_net(e, side, self.field(0)) for e in self.scene.elements for side in e.free_sides]
 
-    def whole(self, heights: Tensor) -> Tensor:
+    def all_surfaces(self, heights: Tensor) -> Tensor:
         return heights if heights.ndim == 3 else torch.stack([*self._spheres(), heights])
 
     def _bounds(self, k: int) -> tuple[Tensor, Tensor]:

@@ -63,7 +63,7 @@ class LensEvaluation:
         self.refined = any(s.waves for s in designer.stages[: state.stage + 1])
         self.seen = Resolution.before(designer.scene, size)
         self.target = designer.problem.target.numpy()
-        self.start: dict[str, Any] | None = None  # figures of the initial surface
+        self.initial: dict[str, Any] | None = None  # figures of the initial surface
         self.exposure, self.light, self.figures = self.see(state.heights)
 
     def rays(self, heights: Tensor, noise: bool = True) -> tuple[Image, dict[str, Any]]:
@@ -96,35 +96,38 @@ class LensEvaluation:
         by_likeness = {name for _, name in parse(problem.options.loss)} <= LIKENESS
         if state.start is None or not by_likeness:
             return
-        heights = problem.feasible(state.stage, self.designer.begun(state))
+        heights = problem.feasible(state.stage, self.designer.initial_surface(state))
         # other light has an estimate of the noise anyway
-        _, light, began = self.see(heights, noise=not problem.scene.source.collimated or state.unrounded is not None)
+        _, light, initial = self.see(heights, noise=not problem.scene.source.collimated or state.unrounded is not None)
         figures = self.figures
-        if _worse(figures, began):
-            why = f"its start was better and is kept: {_difference(figures, began)}"
+        if _worse(figures, initial):
+            why = f"its start was better and is kept: {_difference(figures, initial)}"
             self.state = replace(self.designer.showing(state, heights), reason=f"{state.reason}; {why}")
             self.exposure, retraced = self.rays(heights)
-            figures, self.light = began | retraced, light
-        elif began["on_screen"] > 0:
-            likeness, light_of = _keys(figures, began)
-            if figures[likeness] > began[likeness]:
-                brighter = figures[light_of] / began[light_of] - 1.0
-                why = f"its start was more like the picture, this lens is {brighter:.1%} brighter: {_difference(figures, began)}"
+            figures, self.light = initial | retraced, light
+        elif initial["on_screen"] > 0:
+            likeness, light_of = _keys(figures, initial)
+            if figures[likeness] > initial[likeness]:
+                brighter = figures[light_of] / initial[light_of] - 1.0
+                why = f"its start was more like the picture, this lens is {brighter:.1%} brighter: {_difference(figures, initial)}"
                 self.state = replace(state, reason=f"{state.reason}; {why}")
-        self.start = began
-        self.figures = figures | {"start_error": judged(began, self.refined)["error"], "start_relative_rms": began["relative_rms"]}
-        if began["noise"] is not None:
-            self.figures |= {"start_noise": began["noise"]}
+        self.initial = initial
+        self.figures = figures | {
+            "start_error": judged(initial, self.refined)["error"],
+            "start_relative_rms": initial["relative_rms"],
+        }
+        if initial["noise"] is not None:
+            self.figures |= {"start_noise": initial["noise"]}
         if self.refined:
-            self.figures |= {"start_wave_relative_rms": began["wave_relative_rms"]}
+            self.figures |= {"start_wave_relative_rms": initial["wave_relative_rms"]}
 
     def compare_unrounded(self) -> None:
         """Add the cost of a least radius, if there is one."""
         state, problem = self.state, self.problem
         if state.unrounded is None:
             return
-        rounded = self.start or self.rays(problem.feasible(state.stage, self.designer.begun(state)))[1]
-        unrounded = self.rays(self.designer.begun(state, rounded=False))[1]
+        rounded = self.initial or self.rays(problem.feasible(state.stage, self.designer.initial_surface(state)))[1]
+        unrounded = self.rays(self.designer.initial_surface(state, rounded=False))[1]
         self.figures |= {"min_radius": radius_figures(problem.options.limits.min_radius, rounded, unrounded)}
 
     def add_unseen(self) -> None:
@@ -150,13 +153,13 @@ def radius_figures(radius: float, rounded: dict, unrounded: dict) -> dict[str, f
         radius_mm; start_in_black and start_in_black_without, fractions of the light on the screen; in_black_per_mm, their
         difference over the radius, and its noise; None if the picture has no black region.
     """
-    one, other = rounded["in_black"], unrounded["in_black"]
+    light, light_without = rounded["in_black"], unrounded["in_black"]
     noises = rounded["in_black_noise"], unrounded["in_black_noise"]
     return {
         "radius_mm": radius,
-        "start_in_black": one,
-        "start_in_black_without": other,
-        "in_black_per_mm": None if one is None or other is None else (one - other) / radius,
+        "start_in_black": light,
+        "start_in_black_without": light_without,
+        "in_black_per_mm": None if light is None or light_without is None else (light - light_without) / radius,
         "noise": None if None in noises else math.hypot(*noises) / radius,
     }
 

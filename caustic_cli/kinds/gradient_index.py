@@ -103,7 +103,7 @@ class IndexPlate(OneSurface):
             show("index", f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", k, total)
 
         blank = replace(self.scene, lens=replace(self.scene.lens, gradient=None))
-        found = design_gradient_index(
+        design = design_gradient_index(
             blank,
             target,
             lens.index_control,
@@ -129,7 +129,7 @@ class IndexPlate(OneSurface):
         flat = torch.full(lens.control, float(self.scene.lens.offset.thickness), dtype=torch.float64)
         seconds = rows[-1][-1] if rows else 0.0
         state = State(flat, iteration=done, total=done, history=rows, seconds=seconds, reason=reason)
-        return found.index.coefficients.numpy(), state
+        return design.index.coefficients.numpy(), state
 
     def words(self, lens: LensSettings) -> str:
         """What is designed, before it is."""

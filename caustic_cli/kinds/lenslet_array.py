@@ -31,11 +31,11 @@ class LensletArray(OneSurface):
     """An array of lenslets.
 
     Args:
-        own: (n_x, n_y) targets of the lenslets, j fastest; one for all is `target`.
+        targets: (n_x, n_y) targets of the lenslets, j fastest; one for all is `target`.
     """
 
-    def __init__(self, *args: Any, own: Sequence[Tensor] = (), **more: Any):
-        self.own = list(own)
+    def __init__(self, *args: Any, targets: Sequence[Tensor] = (), **more: Any):
+        self.targets = list(targets)
         super().__init__(*args, **more)
 
     @classmethod
@@ -44,8 +44,8 @@ class LensletArray(OneSurface):
 
     @classmethod
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
-        own = [torch.from_numpy(one) for one in described.targets(scene)]
-        return {"own": own if len(own) > 1 else []} | super().further(described, scene)
+        targets = [torch.from_numpy(target) for target in described.targets(scene)]
+        return {"targets": targets if len(targets) > 1 else []} | super().further(described, scene)
 
     @classmethod
     def refuse_settings(cls, d: Defaults) -> None:
@@ -84,15 +84,15 @@ class LensletArray(OneSurface):
     def takes_lenslets(self, k: int) -> bool:
         return not (self.stages[k].waves or self.stages[k].spread)
 
-    def objective_in(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
+    def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         stage = self.stages[k]
         if not stage.lenslets:
-            return super().objective_in(scene, k, begun)
+            return super().objective_in(scene, k, initial)
         parts = lenslets(self.lit(scene, k), stage.control)
-        own, rays = self.own or [self.target] * len(parts), max(1, stage.rays // len(parts))
-        return array_objective(parts, lambda n, lenslet: self.on_rays(lenslet.scene, k, lenslet.field, own[n], rays))
+        targets, rays = self.targets or [self.target] * len(parts), max(1, stage.rays // len(parts))
+        return array_objective(parts, lambda n, lenslet: self.on_rays(lenslet.scene, k, lenslet.field, targets[n], rays))
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
-        goals = [grey(own.numpy()) for own in self.own] or [goal]
+        goals = [grey(target.numpy()) for target in self.targets] or [goal]
         cells = max(LEAST_CELLS, cells // max(scene.lens.array))
         return InitialSurface(initial_array(scene, goals, self.stages[0].control, cells).heights)

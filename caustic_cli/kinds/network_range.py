@@ -79,7 +79,7 @@ class NetworkOverRange(OneSurface):
     def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
         return RangeAdam
 
-    def objective_in(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
+    def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         stage = self.stages[k]
         middle = self.on_rays(scene, k, self.field(k), self.target, stage.rays)
         return RangeObjective(
@@ -115,17 +115,17 @@ class NetworkOverRange(OneSurface):
             CausticError: no light reaches the screen.
         """
         over, field, target = self.ranges, designer.field(state.stage), self.target.numpy()
-        lens_of_middle, found = self.heights_at(designer, state, over.middle), []
+        lens_of_middle, rows = self.heights_at(designer, state, over.middle), []
         for values in over.evaluation_points():
             scene, row = over.scene(self.scene, values), dict(zip(over.keys, values, strict=True))
             heights = self.heights_at(designer, state, values)
-            own = retrace(scene, field, heights, target, rays=rays, seed=seed, device=self.device)[1]
-            row |= {key: own[key] for key in ("relative_rms", "noise", "on_screen", "of_source")}
+            figures = retrace(scene, field, heights, target, rays=rays, seed=seed, device=self.device)[1]
+            row |= {key: figures[key] for key in ("relative_rms", "noise", "on_screen", "of_source")}
             if middle:
-                other = retrace(scene, field, lens_of_middle, target, rays=rays, seed=seed, device=self.device, noise=False)[1]
-                row["middle_relative_rms"] = other["relative_rms"]
-            found.append(row)
-        return found
+                of_middle = retrace(scene, field, lens_of_middle, target, rays=rays, seed=seed, device=self.device, noise=False)[1]
+                row["middle_relative_rms"] = of_middle["relative_rms"]
+            rows.append(row)
+        return rows
 
 
 def _refuse_idle_inputs(trained: bool, initial: str) -> None:

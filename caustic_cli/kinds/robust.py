@@ -41,11 +41,11 @@ class RobustSurface(OneSurface):
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
         return {"tolerances": _tolerances(described.settings)} | super().further(described, scene)
 
-    def objective(self, k: int, begun: Tensor) -> LossOfHeights:
+    def objective(self, k: int, initial: Tensor) -> LossOfHeights:
         if k < len(self.stages) - 1:
-            return super().objective(k, begun)
+            return super().objective(k, initial)
         return robust_objective(
-            lambda scene, heights: self.objective_in(scene, k, heights), self.scene, self.field(k), begun, self.tolerances
+            lambda scene, heights: self.objective_in(scene, k, heights), self.scene, self.field(k), initial, self.tolerances
         )
 
 

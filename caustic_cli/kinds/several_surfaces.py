@@ -28,8 +28,8 @@ class SeveralSurfaces(OneSurface):
         sides[-1] = self.scene.lens.cut_from
         return torch.stack(
             [
-                self.options.limits.feasible(replace(field, half_size=half), one, (low, high), side, rounded)
-                for half, one, low, high, side in zip(self.half_sizes, heights, *self.bounds(k), sides, strict=True)
+                self.options.limits.feasible(replace(field, half_size=half), net, (low, high), side, rounded)
+                for half, net, low, high, side in zip(self.half_sizes, heights, *self.bounds(k), sides, strict=True)
             ]
         )
 

@@ -258,15 +258,15 @@ class OneSurface(Problem):
     def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
         return QuasiNewton if self.stages[k].waves else super().optimiser(k)
 
-    def objective_in(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
+    def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         stage = self.stages[k]
         if stage.waves:
-            return self.on_waves(self.lit(scene, k), k, begun)
-        if stage.spread and (found := self.on_spread(self.lit(scene, k), k, begun)) is not None:
-            return found
-        return super().objective_in(scene, k, begun)
+            return self.on_waves(self.lit(scene, k), k, initial)
+        if stage.spread and (objective := self.on_spread(self.lit(scene, k), k, initial)) is not None:
+            return objective
+        return super().objective_in(scene, k, initial)
 
-    def on_waves(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
+    def on_waves(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         """The objective of stage k on the wave image.
 
         Raises:
@@ -277,7 +277,7 @@ class OneSurface(Problem):
             return waves.WaveObjective(
                 scene,
                 self.field(k),
-                begun,
+                initial,
                 self.target,
                 o.loss,
                 stage.rendering,
@@ -291,11 +291,11 @@ class OneSurface(Problem):
                 raise
             raise Skipped(f"the wave image is not refined: {error}", "no wave image") from error
 
-    def on_spread(self, scene: Scene, k: int, begun: Tensor) -> Objective | None:
+    def on_spread(self, scene: Scene, k: int, initial: Tensor) -> Objective | None:
         """The objective of stage k on the image of the source's centre, convolved with that of the source; None where this is no
         good approximation."""
         stage, o, field = self.stages[k], self.options, self.field(k)
-        if (spread := source_spread(scene, field, begun)) is None:
+        if (spread := source_spread(scene, field, initial)) is None:
             return None
         expected = best_irradiance(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
         scene, rays, spreads = regular_rays(scene, spread, stage, self.seed(k), self.device)
@@ -349,9 +349,9 @@ class OneSurface(Problem):
         if spread is not None:
             light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
             scene, goal = replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
-        found, lens = self.solved(scene, goal, cells, fixed, seconds), self.scene.lens
-        short = lens.z_in + lens.min_thickness - float(found.heights.min())
-        return replace(found, heights=found.heights + 1.01 * short) if fixed and short > 0 else found
+        surface, lens = self.solved(scene, goal, cells, fixed, seconds), self.scene.lens
+        short = lens.z_in + lens.min_thickness - float(surface.heights.min())
+        return replace(surface, heights=surface.heights + 1.01 * short) if fixed and short > 0 else surface
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
         """`transport` of the light of a scene to an irradiance on its screen, with this number of source cells."""
@@ -424,19 +424,19 @@ class OneSurface(Problem):
             size: width and height of the picture, mm; timed: under a time limit, do not increase the number of rays, and limit the
                 iterations for the least error.
         """
-        found = LensEvaluation(designer, state, self.final_rays, size, timed)
+        evaluation = LensEvaluation(designer, state, self.final_rays, size, timed)
         if self.one_scene:
-            found.compare_with_start()
-        found.compare_unrounded()
+            evaluation.compare_with_start()
+        evaluation.compare_unrounded()
         bounds = self.source_limits(SMOOTH_STEPS if timed else None)
-        found.figures |= {
+        evaluation.figures |= {
             key: bound
             for key, bound in (("least_relative_rms", bounds.error), ("etendue_limit", bounds.etendue))
             if bound is not None
         }
-        found.add_unseen()
-        found.figures |= self.further_figures(designer, found.state)
-        return found.result()
+        evaluation.add_unseen()
+        evaluation.figures |= self.further_figures(designer, evaluation.state)
+        return evaluation.result()
 
     def errors(self, designer: Designer, state: State, rays: int, seed: int, middle: bool = True) -> list[dict[str, Any]]:
         """Figures of the lens with independent rays, a row for each scene that it is for.
@@ -444,8 +444,8 @@ class OneSurface(Problem):
         Raises:
             CausticError: no light reaches the screen.
         """
-        found = trace_arguments(self.scene, designer.field(state.stage), state.heights)
-        return [retrace(*found, self.target.numpy(), rays=rays, seed=seed, device=self.device)[1]]
+        traced = trace_arguments(self.scene, designer.field(state.stage), state.heights)
+        return [retrace(*traced, self.target.numpy(), rays=rays, seed=seed, device=self.device)[1]]
 
     def further_figures(self, designer: Designer, state: State) -> dict[str, Any]:
         """Figures beyond those of any kind."""

@@ -41,13 +41,13 @@ class TwoSides(SeveralSurfaces):
     """Entrance and exit.
 
     Args:
-        second: (k_x, k_y) irradiance on the scene's second screen, where it has one.
+        second_target: (k_x, k_y) irradiance on the scene's second screen, where it has one.
     """
 
     adapts = False
 
-    def __init__(self, *args: Any, second: Tensor | None = None, **more: Any):
-        self.second = second
+    def __init__(self, *args: Any, second_target: Tensor | None = None, **more: Any):
+        self.second_target = second_target
         super().__init__(*args, **more)
 
     @classmethod
@@ -56,8 +56,8 @@ class TwoSides(SeveralSurfaces):
 
     @classmethod
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
-        second = described.second_target(scene)
-        return {"second": None if second is None else torch.from_numpy(second)}
+        target = described.second_target(scene)
+        return {"second_target": None if target is None else torch.from_numpy(target)}
 
     @classmethod
     def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
@@ -99,9 +99,9 @@ class TwoSides(SeveralSurfaces):
         laplacian = self.options.parametrisation.preconditioner == "laplacian"
         return SidesTogether(*self.bounds(k), start, laplacian, light)
 
-    def objective_in(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
+    def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         stage, o, scene = self.stages[k], self.options, self.lit(scene, k)
-        targets = (self.target,) if self.second is None else (self.target, self.second)
+        targets = (self.target,) if self.second_target is None else (self.target, self.second_target)
         rays = rays_of(scene, stage.sampler, stage.rays, self.seed(k), self.device)
         return TwoSidedObjective(scene, self.field(k), rays, targets, o.loss, stage.rendering, limits=o.limits, dtype=o.dtype)
 
@@ -109,8 +109,8 @@ class TwoSides(SeveralSurfaces):
         """Its own initial surfaces say what they cannot reach."""
 
     def transport(self, fixed: bool, seconds: float) -> InitialSurface:
-        second = None if self.second is None else self.second.numpy()
-        return InitialSurface(first_sides(self.scene, grey(self.target.numpy()), second, self.field(0)))
+        target = None if self.second_target is None else self.second_target.numpy()
+        return InitialSurface(first_sides(self.scene, grey(self.target.numpy()), target, self.field(0)))
 
     def advice(self, size: tuple[float, float]) -> str:
         return ""
@@ -118,7 +118,7 @@ class TwoSides(SeveralSurfaces):
     def evaluate(self, designer: Designer, state: State, size: tuple[float, float], timed: bool = False) -> Evaluated:
         """By the picture, and a second picture or the ray directions behind it."""
         target, field, seed = self.target.numpy(), designer.field(state.stage), self.options.seed
-        farther, final = None if self.second is None else self.second.numpy(), self.final_rays
+        farther, final = None if self.second_target is None else self.second_target.numpy(), self.final_rays
 
         def trace(heights: Tensor, rays: int) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
             scene, exit = split_heights(self.scene, field, heights)
@@ -129,13 +129,13 @@ class TwoSides(SeveralSurfaces):
 
         image, second, figures = trace(state.heights, final)
         if state.start is not None:
-            began = trace(designer.begun(state), final // STARTS)[2]
-            figures |= {"start_error": began["relative_rms"]}
+            initial = trace(designer.initial_surface(state), final // STARTS)[2]
+            figures |= {"start_error": initial["relative_rms"]}
             figures |= {
-                f"start_{key}": began[key] for key in ("relative_rms", "second_relative_rms", "angle_rms_mrad") if key in began
+                f"start_{key}": initial[key] for key in ("relative_rms", "second_relative_rms", "angle_rms_mrad") if key in initial
             }
             if state.unrounded is not None:
-                unrounded = trace(designer.begun(state, rounded=False), final // STARTS)[2]
-                figures |= {"min_radius": radius_figures(self.options.limits.min_radius, began, unrounded)}
+                unrounded = trace(designer.initial_surface(state, rounded=False), final // STARTS)[2]
+                figures |= {"min_radius": radius_figures(self.options.limits.min_radius, initial, unrounded)}
         pair = None if second is None or farther is None else (second, farther)
         return Evaluated(state, judged(figures, False), image, farther=pair)

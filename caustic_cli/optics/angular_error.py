@@ -17,7 +17,7 @@ def squared_angular_error(traced: Tracer, state: RayState, scene: Scene) -> Tens
     differentiable."""
     ray = traced.onto(state, scene.screen)
     dz = torch.as_tensor(ray.direction[2])
-    squares, focus = torch.zeros((), dtype=torch.float64), scene.second.focus if scene.second else None
+    squares, focus = torch.zeros((), dtype=torch.float64), scene.second_target.focus if scene.second_target else None
     for k in (0, 1):
         tangent = ray.direction[k] / dz
         if focus is not None:

@@ -113,8 +113,8 @@ def _exit(scene: Scene, inside: float, slope: float, most: float, heights: Tenso
 
 def _through(scene: Scene, lean: float) -> float:
     """Bound of the rays' angle to z behind the elements in front of the lens, from the bound `lean` in front of these."""
-    system = System.of(scene) if scene.before else None
-    for k, element in enumerate(system.elements[: 2 * len(scene.before)] if system else ()):
+    system = System.of(scene) if scene.in_front else None
+    for k, element in enumerate(system.elements[: 2 * len(scene.in_front)] if system else ()):
         assert system is not None
         normal = math.atan(math.hypot(*element.surface.slope_bounds(None))) if element.surface.shape is None else 0.5 * math.pi
         before, behind = (medium.index for medium in system.media()[k : k + 2])
@@ -141,7 +141,7 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     source, lens = scene.source, scene.lens
     if scene.axial:
         return 1.0
-    if lowest < lens.z_in or scene.before:
+    if lowest < lens.z_in or scene.in_front:
         return math.inf
     low = min(0.0, entrance_of(lens).hull(None)[0]) if lens.entrance is not None else 0.0
     drift = (top - lens.z_in - low) * math.tan(min(inside, 1.57))

@@ -56,16 +56,14 @@ def open_knots(n: int, degree: int, parts: int = 1) -> Tensor:
 class SplineSpace:
     """The B-splines of one degree over one open knot vector on [0, 1].
 
-    Args:
-        degree: polynomial degree p, 1 to 15.
-        knots: (n + p + 1,) non-decreasing; end knots 0 and 1 with multiplicity p + 1, inner ones at most p
-            (multiplicity p + 1 makes the surface discontinuous and is rejected).
-
     Raises:
         InputError: the degree or the knot vector is not of that form.
     """
 
+    #: Polynomial degree p, 1 to 15.
     degree: int
+    #: (n + p + 1,) non-decreasing; end knots 0 and 1 with multiplicity p + 1, inner ones at most p (multiplicity p + 1 makes the
+    #: surface discontinuous and is rejected).
     knots: Tensor
 
     def __post_init__(self):

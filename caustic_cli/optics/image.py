@@ -15,12 +15,15 @@ Amount = TypeVar("Amount", bound=Tensor | float)
 class Image(Generic[Amount]):
     """Power on a screen's pixels and all losses, as fractions of the source's power.
 
-    image: (n_x, n_y) float64, or (3, n_x, n_y) with colours; leaving: power behind the last element, () or (3,); lost: power lost,
-    by name, see `rays.LOSSES`.  While rays are traced all three are tensors, image and leaving differentiable; for a complete image
-    leaving and lost are numbers.  rays: their number.  Over all rays of a source image.sum() + sum(lost.values()) = 1.
+    While rays are traced all three are tensors, image and leaving differentiable; for a complete image leaving and lost are
+    numbers.  Over all rays of a source image.sum() + sum(lost.values()) = 1.
     """
 
+    #: (n_x, n_y) float64, or (3, n_x, n_y) with colours.
     image: Tensor
+    #: Power behind the last element, () or (3,).
     leaving: Amount
+    #: Power lost, by name, see `rays.LOSSES`.
     lost: dict[str, Amount]
+    #: Their number.
     rays: int = 0

@@ -46,19 +46,18 @@ class RayTracer(Protocol):
 
 @dataclass
 class Interaction:
-    """Rays at one element; what effects read and modify.
+    """Rays at one element; what effects read and modify."""
 
-    tracer, index: the tracer, and the element's number; forward: whether light propagates in the system's nominal direction;
-    direct: whether this is the nominal path, not stray light; state: the rays at the surface, with global origins, and directions
-    in front of it before the interaction, behind it afterwards; n_in, n_out: refractive indices in front of and behind the surface
-    in the direction of the light, (N,) for gradient-index media.
-    """
-
+    #: The tracer, and the element's number.
     tracer: RayTracer
     index: int
+    #: Whether light propagates in the system's nominal direction.
     forward: bool
+    #: Whether this is the nominal path, not stray light.
     direct: bool
+    #: The rays at the surface, with global origins, and directions in front of it before the interaction, behind it afterwards.
     state: RayState
+    #: Refractive indices in front of and behind the surface in the direction of the light, (N,) for gradient-index media.
     n_in: float | Tensor
     n_out: float | Tensor
     #: Set where the rays meet the surface.
@@ -96,12 +95,12 @@ class Interaction:
         """The light that a refracting element reflects, as rays that start at its surface."""
         assert self.power_in is not None and self.out is not None
         hit, element = self.hit, self.element
-        found = self.tracer.backend.interact(
+        reflected = self.tracer.backend.interact(
             hit.incoming, hit.slopes, self.power_in, eta=1.0, reflects=True, fresnel=element.fresnel, side=self.side
         )
         return replace(
             self.state,
-            direction=rotate_to_global(element.pose, found.direction),
+            direction=rotate_to_global(element.pose, reflected.direction),
             power=self.power_in - self.out.power,
             lost={},
             sample=None,

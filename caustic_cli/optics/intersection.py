@@ -43,16 +43,13 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Method:
-    """Method of intersection with a B-spline.
+    """Method of intersection with a B-spline."""
 
-    Args:
-        name: newton, mesh, or mesh+newton, Newton's method started from the intersection with the mesh.
-        parts: (n_u, n_v), subdivisions of each knot span by the mesh.
-        recursive: find the mesh's knot span products by a quadtree, or by testing all of them.
-    """
-
+    #: newton, mesh, or mesh+newton, Newton's method started from the intersection with the mesh.
     name: str = "newton"
+    #: (n_u, n_v), subdivisions of each knot span by the mesh.
     parts: tuple[int, int] = (4, 4)
+    #: Find the mesh's knot span products by a quadtree, or by testing all of them.
     recursive: bool = True
 
     def __post_init__(self):

@@ -16,8 +16,8 @@ from caustic_cli.optics.system import Element, PlacedScreen
 from caustic_cli.scene import Pupil, Screen
 
 
-def lowered(tracer, before: Fused | None) -> Fused | None:
-    """The rest of a tracer's system as one fused kernel; None where it does not apply.  before: that of the previous chunk, whose
+def lowered(tracer, previous: Fused | None) -> Fused | None:
+    """The rest of a tracer's system as one fused kernel; None where it does not apply.  previous: that of the previous chunk, whose
     prepared arrays are reused."""
     system, start, (inside, outside) = tracer.system, tracer.start, tracer.media[-2:]
     element = system.elements[-1]
@@ -30,10 +30,10 @@ def lowered(tracer, before: Fused | None) -> Fused | None:
     if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface
         return None
     if not start.along_axis:
-        return tracer.backend.ray_image(element.surface, start, eta, element.fresnel, element.aperture.radius, before)
+        return tracer.backend.ray_image(element.surface, start, eta, element.fresnel, element.aperture.radius, previous)
     if element.aperture != system.pupil.aperture:
         return None
-    return tracer.backend.plane_image(element.surface, start, eta, element.fresnel, before)
+    return tracer.backend.plane_image(element.surface, start, eta, element.fresnel, previous)
 
 
 def _is_plain(element: Element, pupil: Pupil) -> bool:

@@ -22,16 +22,14 @@ from caustic_cli.scene.materials import refractive_index
 class Medium:
     """A homogeneous medium.
 
-    Args:
-        index: refractive index; for a glass, that of rays without a wavelength.
-        absorption: absorption coefficient a, 1/mm; the transmittance of t mm is exp(-a t) (Beer-Lambert).
-        glass: a dispersive material, by its name in `materials`; None for `index` at every wavelength.
-
     varies: whether the index varies with position.
     """
 
+    #: Refractive index; for a glass, that of rays without a wavelength.
     index: float = 1.0
+    #: Absorption coefficient a, 1/mm; the transmittance of t mm is exp(-a t) (Beer-Lambert).
     absorption: float = 0.0
+    #: A dispersive material, by its name in `materials`; None for `index` at every wavelength.
     glass: str | None = None
 
     varies: ClassVar[bool] = False

@@ -40,15 +40,16 @@ DOUBLINGS, BISECTIONS, SHORTER = 16, 7, 0.95
 
 @dataclass(frozen=True)
 class Body:
-    """A box or a cylinder, with the name by which messages call it.
-
-    origin: mm; axes: unit vectors of its frame; aperture: its outline along x and y; depth: range along z, mm.
-    """
+    """A box or a cylinder, with the name by which messages call it."""
 
     name: str
+    #: mm.
     origin: tuple[float, float, float]
+    #: Unit vectors of its frame.
     axes: Axes
+    #: Its outline along x and y.
     aperture: Aperture
+    #: Range along z, mm.
     depth: tuple[float, float] = (0.0, 0.0)
 
     def crossed(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -241,11 +242,11 @@ def _stations(scene: Scene) -> tuple[list[Body], ScreenBody]:
         name, depth = f"the {part.kind} of [[element]] {number + 1}", (low - part.z, high - part.z)
         return Body(name, pose.position, pose.axes, part.opening, depth)
 
-    found = [body(k, part) for k, part in enumerate(scene.before)]
+    found = [body(k, part) for k, part in enumerate(scene.in_front)]
     name = "the free-form lens" if scene.elements else f"the {lens.kind}"
     depth = lens.interaction.extent(lens.lowest, lens.offset.thickness)
     found.append(Body(name, (0.0, 0.0, 0.0), IDENTITY, lens.opening.grown(lens.border), depth))
-    for k, part in enumerate(scene.behind, len(scene.before)):
+    for k, part in enumerate(scene.behind, len(scene.in_front)):
         found.append(body(k, part))
         leg = part.axis_behind(leg)
     return found, ScreenBody(scene.screen, leg)

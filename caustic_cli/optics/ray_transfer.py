@@ -36,12 +36,12 @@ def meet(tracer, m, heights: Tensor | None) -> None:
     hit = _intersection(tracer, m, o, d, heights, prepared)
     if state.power.dtype != tracer.dtype:  # the first intersection is always computed in float64
         t, gx, gy = (_cast(c, tracer.dtype) for c in hit[:3])
-        state, hit = state.to(tracer.dtype), SurfaceIntersection(t, gx, gy, hit.found)
+        state, hit = state.to(tracer.dtype), SurfaceIntersection(t, gx, gy, hit.valid)
         o, d = (tuple(_cast(c, tracer.dtype) for c in v) for v in (o, d))
     m.hit = Hit(advance(o, d, hit.t), d, (hit.gx, hit.gy), hit.t)
     on_surface = prepared is not None and state.sample is not None and _is_pupil(element, system)  # points of the same aperture
     if not on_surface:
-        tracer.keep(state, _passed(element, m.hit, hit.found))
+        tracer.keep(state, _passed(element, m.hit, hit.valid))
     state.origin = to_global(element.pose, m.hit.local, state.datum)
     state.path = state.path + m.n_in * hit.t
     m.state = state
@@ -68,11 +68,11 @@ def _is_pupil(element, system) -> bool:
     return element.aperture == system.pupil.aperture
 
 
-def _passed(element, hit: Hit, found: Tensor) -> Tensor:
-    """Which of the rays `found` to meet an element's surface are within its aperture."""
+def _passed(element, hit: Hit, valid: Tensor) -> Tensor:
+    """Which of the rays that meet an element's surface, the `valid` ones, are within its aperture."""
     if element.aperture != Aperture(element.surface.half_size):
-        found = found & element.aperture.contains(*hit.local[:2])
-    return found
+        valid = valid & element.aperture.contains(*hit.local[:2])
+    return valid
 
 
 def _moved_before_surface(tracer, o, d, state: RayState, element, heights) -> tuple[tuple, RayState]:
@@ -108,8 +108,8 @@ def prepared_intersection(tracer):
         def sampled(heights: Tensor) -> SurfaceIntersection:
             sag, gx, gy = evaluate(surface.centred(heights)[0])
             below = start.origin[2] - pz - float(heights.detach().double().mean()) - start.datum
-            found = torch.ones((), dtype=torch.bool, device=sag.device).expand(sag.shape)
-            return SurfaceIntersection(sag - below, gx, gy, found)
+            valid = torch.ones((), dtype=torch.bool, device=sag.device).expand(sag.shape)
+            return SurfaceIntersection(sag - below, gx, gy, valid)
 
         return sampled
     spread = start.expanded()

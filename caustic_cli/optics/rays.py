@@ -83,8 +83,8 @@ class RayState:
 
     def mark(self, where: Tensor, status: RayStatus) -> None:
         """Set the status of the rays `where` that are still OK."""
-        before = torch.zeros(where.shape, dtype=torch.int64, device=where.device) if self.status is None else self.status
-        self.status = torch.where(where & (before == RayStatus.OK), int(status), before)
+        status_so_far = torch.zeros(where.shape, dtype=torch.int64, device=where.device) if self.status is None else self.status
+        self.status = torch.where(where & (status_so_far == RayStatus.OK), int(status), status_so_far)
 
     def statuses(self) -> Tensor:
         """A `RayStatus` for every ray, (N,) int64."""

@@ -28,16 +28,13 @@ MAX_FILTER = 63
 
 @dataclass(frozen=True)
 class Filter:
-    """A reconstruction filter.
+    """A reconstruction filter."""
 
-    Args:
-        kind: bincount, gaussian (truncated, C0: eq. 4.4.5) or cosine (raised cosine, C1).
-        size: (v_x, v_y) pixels, odd; 1 is bincount along that axis.
-        alpha: (alpha_x, alpha_y) of the Gaussian per pixel squared; alpha per mm^2 times w^2 (erratum E15).
-    """
-
+    #: bincount, gaussian (truncated, C0: eq. 4.4.5) or cosine (raised cosine, C1).
     kind: str = "bincount"
+    #: (v_x, v_y) pixels, odd; 1 is bincount along that axis.
     size: tuple[int, int] = (1, 1)
+    #: (alpha_x, alpha_y) of the Gaussian per pixel squared; alpha per mm^2 times w^2 (erratum E15).
     alpha: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):

@@ -56,7 +56,7 @@ class Resolution:
         """Of a scene with a picture of this width, mm, and a lens of this (local) magnification."""
         lens, screen = scene.lens, scene.screen
         said = scene.light.wavelengths
-        wavelength = sum(w * p for w, p in zip(said, scene.light.parts, strict=True)) if said else GREEN
+        wavelength = sum(w * p for w, p in zip(said, scene.light.fractions, strict=True)) if said else GREEN
         distance = abs(screen.z - lens.offset.thickness)
         return cls(
             diffraction_blur(wavelength, distance, magnification),

@@ -128,14 +128,12 @@ def scattered_points(
 
 @dataclass(frozen=True)
 class Sample:
-    """Some rays of a sampler: the points (u_k, v_k), or with `tensor` all pairs (u_a, v_b), in row-major order.
-
-    flux: fraction of the source's power of each ray, a scalar or of the shape of the ray grid.
-    """
+    """Some rays of a sampler: the points (u_k, v_k), or with `tensor` all pairs (u_a, v_b), in row-major order."""
 
     u: Tensor
     v: Tensor
     tensor: bool
+    #: Fraction of the source's power of each ray, a scalar or of the shape of the ray grid.
     flux: Tensor
 
     @property
@@ -146,22 +144,19 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Sampler:
-    """A sampler of the aperture, evaluated in chunks.
+    """A sampler of the aperture, evaluated in chunks."""
 
-    Args:
-        kind: one of SAMPLERS.
-        shape: cells (nu, nv) along u and v; nu * nv rays.
-        seed: of the random kinds.
-        profile: relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3).
-        aperture: of any half widths.
-        device: where the samples live.
-    """
-
+    #: One of SAMPLERS.
     kind: str
+    #: Cells (nu, nv) along u and v; nu * nv rays.
     shape: tuple[int, int]
+    #: Of the random kinds.
     seed: int = 0
+    #: Relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3).
     profile: Tensor | None = None
+    #: Where the samples live.
     device: str | torch.device = "cpu"
+    #: Of any half widths.
     aperture: Aperture = UNBOUNDED
 
     def __post_init__(self):

@@ -65,8 +65,8 @@ class CurvedScreen(PlaneScreen):
         o, d = (tuple(torch.as_tensor(c, dtype=torch.float64, device=like.device).expand(like.shape) for c in v) for v in (o, d))
         heights = None if self.heights is None else self.heights.to(like.device)
         hit = self.surface.intersect(heights, o, d, forward)
-        x, y = (torch.where(hit.found, a + hit.t * b, a).to(like.dtype) for a, b in zip(o[:2], d[:2], strict=True))
-        return x, y, hit.found
+        x, y = (torch.where(hit.valid, a + hit.t * b, a).to(like.dtype) for a, b in zip(o[:2], d[:2], strict=True))
+        return x, y, hit.valid
 
     def at(self, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
         """S, S_x and S_y at points of a common shape, float64."""

@@ -44,20 +44,20 @@ Landing = Callable[[Mode, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor,
 
 @dataclass(frozen=True)
 class Spread:
-    """The point-spread function of a source on the screen.
+    """The point-spread function of a source on the screen."""
 
-    half: half axes of its ellipse, mm, 0 for point sources; shifts: images (dx, dy), mm, of the source's positions, with their
-    fractions of the power; error, usual: see the module; brightness: of the source over its frame, (n, m) [i, j], None if uniform
-    over the ellipse; frame: half widths of the frame's image, mm, negative where it is mirrored; skew: of an image that is sheared
-    (a, b): a point (x, y) of the image as given by the other fields lies at (x + a y, y + b x).
-    """
-
+    #: Half axes of its ellipse, mm, 0 for point sources.
     half: tuple[float, float]
+    #: Images (dx, dy), mm, of the source's positions, with their fractions of the power.
     shifts: tuple[tuple[float, float, float], ...]
+    #: See the module.
     error: float
     usual: float = 0.0
+    #: Of the source over its frame, (n, m) [i, j], None if uniform over the ellipse.
     brightness: np.ndarray | None = None
+    #: Half widths of the frame's image, mm, negative where it is mirrored.
     frame: tuple[float, float] = (0.0, 0.0)
+    #: Of an image that is sheared (a, b): a point (x, y) of the image as given by the other fields lies at (x + a y, y + b x).
     skew: tuple[float, float] = (0.0, 0.0)
 
     def reach(self) -> tuple[float, float]:
@@ -208,7 +208,7 @@ def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | Non
     system, parameters = System.of(scene, field), {EXIT: heights.detach().double()}
 
     def landing(mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        tracer = Tracer(system, mode.through(u, v, system.before.index_at(None)))
+        tracer = Tracer(system, mode.through(u, v, system.object_space.index_at(None)))
         state, left = tracer.land(parameters, scene.screen)[0].expanded(), tracer.last(parameters).state.expanded()
         return *state.full(state.origin)[:2], state.power, *left.full(left.origin)[:2]
 

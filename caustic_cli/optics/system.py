@@ -4,7 +4,7 @@
     Element  = Surface + Aperture + refract or reflect + Medium behind it + Pose
 
 Lengths are mm, angles degrees.  An element's frame has its origin at `Pose.position` and, apart from its tilt, its z axis along the
-nominal direction of light.  The object space is air (`before`); behind a mirror light is again in the medium in front of it.
+nominal direction of light.  The object space is air (`object_space`); behind a mirror light is again in the medium in front of it.
 
 Control heights of free-form surfaces are not part of a system: `trace` takes them as {name of the element: (n, m) tensor, mm}.
 """
@@ -35,23 +35,20 @@ ENTRANCE, EXIT = "entrance", "exit"
 
 @dataclass(frozen=True)
 class Element:
-    """One surface of a system; see the module.
+    """One surface of a system; see the module."""
 
-    Args:
-        name: of the element, and key of its surface's heights.
-        interaction: refract or reflect.
-        behind: the medium behind it; ignored for a mirror.
-        fresnel: reflection losses of a refracting surface: none, schlick or exact.
-        roughness: standard deviation, along either axis, of the slopes of its microfacets relative to the smooth surface.
-    """
-
+    #: Of the element, and key of its surface's heights.
     name: str
     surface: Surface
     aperture: Aperture = field(default_factory=Aperture)
+    #: refract or reflect.
     interaction: str = "refract"
+    #: The medium behind it; ignored for a mirror.
     behind: Medium = AIR
     pose: Pose = field(default_factory=Pose)
+    #: Reflection losses of a refracting surface: none, schlick or exact.
     fresnel: str = "exact"
+    #: Standard deviation, along either axis, of the slopes of its microfacets relative to the smooth surface.
     roughness: float = 0.0
 
     def __post_init__(self):
@@ -115,7 +112,7 @@ def _elements_of(
     component: Component, number: int, leg: AxisSegment, scene: Scene, spaces: tuple[SplineSpace, SplineSpace]
 ) -> list[Element]:
     """The surfaces of a component on an axis segment; a free surface without heights uses these spline spaces."""
-    found, glass = [], Medium(component.index, component.absorption, component.glass)
+    elements, glass = [], Medium(component.index, component.absorption, component.glass)
     for side in component.sides:
         front, radius = component.surfaces[SIDES.index(side)], component.radius[SIDES.index(side)]
         surface: Surface
@@ -128,8 +125,8 @@ def _elements_of(
         pose = leg.pose(component.vertex(side), component.tilt)
         name, opening = surface_name(number, side), component.opening
         behind = glass if side == "front" else AIR
-        found.append(Element(name, surface, opening, component.interaction.name, behind, pose, scene.lens.fresnel))
-    return found
+        elements.append(Element(name, surface, opening, component.interaction.name, behind, pose, scene.lens.fresnel))
+    return elements
 
 
 @dataclass(frozen=True)
@@ -144,29 +141,27 @@ class PlacedScreen:
 class System:
     """A sequential system; see the module.
 
-    Args:
-        sources: simultaneous, mutually incoherent sources.
-        elements: in the order in which light reaches them.
-        screens: each collects all light in its plane, as if the others were absent.
-        before: the medium in front of the first element.
-        lit: the pupil that the sources illuminate; None for the first element's aperture.
-        leg: the segment of a folded axis that a `Screen` refers to; None for a straight axis.
-
     Raises:
         InputError: there is no element or no source, names are not unique, the first aperture is infinite, or an element is
             parallel to the axis.
     """
 
+    #: Simultaneous, mutually incoherent sources.
     sources: tuple[Source, ...]
+    #: In the order in which light reaches them.
     elements: tuple[Element, ...]
+    #: Each collects all light in its plane, as if the others were absent.
     screens: tuple[Screen | PlacedScreen, ...] = ()
     light: Light = field(default_factory=Light)
-    before: Medium = AIR
+    #: The medium in front of the first element.
+    object_space: Medium = AIR
+    #: The pupil that the sources illuminate; None for the first element's aperture.
     lit: Pupil | None = None
+    #: The segment of a folded axis that a `Screen` refers to; None for a straight axis.
     leg: AxisSegment | None = None
 
     def __post_init__(self):
-        self.before.check_first()
+        self.object_space.check_first()
         if not self.elements or not self.sources:
             raise InputError("a system needs at least one source and one element")
         names = [e.name for e in self.elements]
@@ -198,10 +193,10 @@ class System:
                 fresnel=lens.fresnel,
             )
             elements = (first, *elements)
-        lit, leg = None if scene.two_sided or scene.before else scene.pupil, AxisSegment()
-        ahead = tuple(e for k, c in enumerate(scene.before) for e in _elements_of(c, k, leg, scene, surface.spaces))
-        elements = (*ahead, *elements)
-        for k, component in enumerate(scene.behind, len(scene.before)):
+        lit, leg = None if scene.two_sided or scene.in_front else scene.pupil, AxisSegment()
+        in_front = tuple(e for k, c in enumerate(scene.in_front) for e in _elements_of(c, k, leg, scene, surface.spaces))
+        elements = (*in_front, *elements)
+        for k, component in enumerate(scene.behind, len(scene.in_front)):
             elements += tuple(_elements_of(component, k, leg, scene, surface.spaces))
             leg = component.axis_behind(leg)
         return cls((scene.source,), elements, (scene.screen,), scene.light, lit=lit, leg=leg if leg != AxisSegment() else None)
@@ -223,29 +218,29 @@ class System:
         return Pupil(first.aperture, first.pose.position[2])
 
     @property
-    def free(self) -> dict[str, tuple[int, int]]:
+    def shapes(self) -> dict[str, tuple[int, int]]:
         """Shapes of the heights of all free-form surfaces, by name."""
         return {e.name: e.surface.shape for e in self.elements if e.surface.shape is not None}
 
     @property
     def effects(self) -> frozenset[str]:
         """Names of the effects on rays (`optics.effects`) that its parts cause."""
-        parts: tuple[Medium | Element | Light, ...] = (*self.media(), *self.elements, self.light)
-        return frozenset[str]().union(*(part.effects for part in parts))
+        components: tuple[Medium | Element | Light, ...] = (*self.media(), *self.elements, self.light)
+        return frozenset[str]().union(*(component.effects for component in components))
 
     def media(self) -> tuple[Medium, ...]:
         """The medium in front of each element, and behind the last."""
-        media = [self.before]
+        media = [self.object_space]
         for element in self.elements:
             media.append(media[-1] if element.reflects else element.behind)
         return tuple(media)
 
     def owners(self) -> tuple[int | None, ...]:
         """Index of the element in front of each of `media`, None for the first medium."""
-        found: list[int | None] = [None]
+        owners: list[int | None] = [None]
         for k, element in enumerate(self.elements):
-            found.append(found[-1] if element.reflects else k)
-        return tuple(found)
+            owners.append(owners[-1] if element.reflects else k)
+        return tuple(owners)
 
     def _along(self) -> tuple[list[float], tuple[float, float, float]]:
         """Cosines between the axis and each element's z axis, and the direction of the axis behind the last element.
@@ -272,7 +267,7 @@ class System:
         return self._along()[1]
 
     @property
-    def parts(self) -> tuple[float, ...]:
+    def fractions(self) -> tuple[float, ...]:
         """Fraction of the total power of each source."""
         total = math.fsum(s.power for s in self.sources)
         return tuple(s.power / total for s in self.sources)

@@ -100,7 +100,7 @@ class Tracer:
         self.entering = self._of_color(weight * state.power.expand(shape).sum(dtype=torch.float64))
         self.actions: tuple[Action, ...] = tuple(a for a in made if a is not None)
         self.recorded = any(a.stray for a in self.actions)
-        self.before: list[Interaction] = []
+        self.interactions_in_front: list[Interaction] = []
         self.first = 0
         self._behind: Interaction | None = None
         with torch.no_grad():
@@ -111,14 +111,14 @@ class Tracer:
             ):
                 interaction = self.trace_element(self.first, state, None)
                 if self.recorded:
-                    self.before.append(interaction)
+                    self.interactions_in_front.append(interaction)
                 state, self.first, self._behind = interaction.state, self.first + 1, interaction
         self.start = state
         self.fused: Fused | None = lowered(self, None if like is None else like.fused)
 
     def __call__(self, parameters: Parameters) -> list[RayState]:
         """Heights {name: (n, m) mm float64} -> rays behind the last element: the direct light, then stray light."""
-        state, interactions = self.start, list(self.before)
+        state, interactions = self.start, list(self.interactions_in_front)
         for interaction in self._interactions(parameters):
             state = interaction.state
             if self.recorded:
@@ -248,12 +248,12 @@ class Tracer:
             action.after_interaction(m)
         return m
 
-    def keep(self, state: RayState, found: Tensor) -> None:
-        """Keep the rays that are `found` to meet a surface, and count the power of the others as lost."""
-        kept = torch.where(found, state.power, torch.zeros_like(state.power))
+    def keep(self, state: RayState, hits: Tensor) -> None:
+        """Keep the rays that meet a surface, the `hits`, and count the power of the others as lost."""
+        kept = torch.where(hits, state.power, torch.zeros_like(state.power))
         state.lose("missed_surface", (state.power - kept).detach())
         if self.track:
-            state.mark(~found, RayStatus.MISSED_SURFACE)
+            state.mark(~hits, RayStatus.MISSED_SURFACE)
         state.power = kept
 
     def _interact(self, m: Interaction) -> OutgoingRays:
@@ -264,7 +264,7 @@ class Tracer:
         if state.polarised is not None:
             polarised = rotate_to_local(element.pose, state.polarised)
         eta = m.n_in / m.n_out
-        found = (self.backend.interact if isinstance(eta, float) else interact)(
+        outgoing = (self.backend.interact if isinstance(eta, float) else interact)(
             m.hit.incoming,
             m.hit.slopes,
             power_in,
@@ -274,21 +274,21 @@ class Tracer:
             polarised=polarised,
             side=m.side,
         )
-        state.direction = rotate_to_global(element.pose, found.direction)
+        state.direction = rotate_to_global(element.pose, outgoing.direction)
         if not m.reflects:
             with torch.no_grad():
-                gone = power_in - found.power
-                if bool(found.passes.all()):
-                    state.lose("fresnel", gone)
+                lost = power_in - outgoing.power
+                if bool(outgoing.passes.all()):
+                    state.lose("fresnel", lost)
                 else:
-                    totally = torch.where(found.passes, torch.zeros_like(gone), gone)
-                    state.lose("fresnel", gone - totally)
+                    totally = torch.where(outgoing.passes, torch.zeros_like(lost), lost)
+                    state.lose("fresnel", lost - totally)
                     state.lose("total_internal_reflection", totally)
             if self.track:
-                state.mark(~found.passes & (power_in > 0), RayStatus.TOTAL_INTERNAL_REFLECTION)
+                state.mark(~outgoing.passes & (power_in > 0), RayStatus.TOTAL_INTERNAL_REFLECTION)
         if any(isinstance(c, Tensor) for c in state.direction) or state.direction != (0.0, 0.0, 1.0):
             state.sample = None
-        return found
+        return outgoing
 
 
 def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUESTS) -> bool:
@@ -309,17 +309,17 @@ def tracers(
     dtype: torch.dtype,
     chunk: int,
     requests: Requests = NO_REQUESTS,
-    part: tuple[int, int] = (0, 1),
+    share: tuple[int, int] = (0, 1),
     **options,
 ) -> Iterator[Tracer]:
     """Tracers of all rays of a sampler through a scene, chunk by chunk, band by band.
 
-    part: (k, n) takes every n-th chunk from number k on, the share of one of n processes.
+    share: (k, n) takes every n-th chunk from number k on, the share of one of n processes.
     """
     bands = scene.bands
     for band in bands:
         system, traced = System.of(band.scene, field), None
-        for rays in of_member(sampler, band.member).chunks(chunk, *part):
+        for rays in of_member(sampler, band.member).chunks(chunk, *share):
             traced = Tracer(system, rays, dtype, requests, traced, weight=band.weight, channel=band.channel, **options)
             yield traced
 
@@ -350,8 +350,8 @@ def expose(
     shape = (*scene.light.planes, *screen.resolution)
 
     def traced_by(size: int) -> Image[float]:
-        parts = tracers(scene, field, sampler, dtype, size, requests)
-        return _total(parts, {EXIT: heights}, [screen], [shape], filter, sampler.count, sampler.device)[0]
+        chunks = tracers(scene, field, sampler, dtype, size, requests)
+        return _total(chunks, {EXIT: heights}, [screen], [shape], filter, sampler.count, sampler.device)[0]
 
     return with_smaller_chunks(traced_by, chunk)
 
@@ -380,20 +380,20 @@ def render(
         CausticError: out of memory.
     """
     shapes = {name: tuple(heights.shape) for name, heights in parameters.items()}
-    if shapes != system.free:
-        raise InputError(f"a system's heights must be {system.free}, got {shapes}")
+    if shapes != system.shapes:
+        raise InputError(f"a system's heights must be {system.shapes}, got {shapes}")
     parameters = {name: heights.detach().to(device, torch.float64) for name, heights in parameters.items()}
     samplers = [rays_of(system.with_source(s), kind, rays, seed, device) for s in system.sources]
     screens = [s.screen if isinstance(s, PlacedScreen) else s for s in system.screens]
 
     def traced_by(size: int) -> list[Image[float]]:
-        parts = (
+        chunks = (
             t
-            for sampler, part in zip(samplers, system.parts, strict=True)
-            for t in system_tracers(system, sampler, part, dtype, size, requests)
+            for sampler, fraction in zip(samplers, system.fractions, strict=True)
+            for t in system_tracers(system, sampler, fraction, dtype, size, requests)
         )
         return _total(
-            parts,
+            chunks,
             parameters,
             system.screens,
             [s.resolution for s in screens],
@@ -406,31 +406,31 @@ def render(
 
 
 def system_tracers(
-    system: System, sampler: Rays, part: float, dtype: torch.dtype, chunk: int, requests: Requests = NO_REQUESTS
+    system: System, sampler: Rays, fraction: float, dtype: torch.dtype, chunk: int, requests: Requests = NO_REQUESTS
 ) -> Iterator[Tracer]:
-    """Tracers of all rays of one source, with the fraction `part` of the total power, at every wavelength, chunk by chunk."""
-    lines = zip(system.light.wavelengths, system.light.parts, strict=True) if system.light.wavelengths else [(None, 1.0)]
+    """Tracers of all rays of one source, with the fraction `fraction` of the total power, at every wavelength, chunk by chunk."""
+    lines = zip(system.light.wavelengths, system.light.fractions, strict=True) if system.light.wavelengths else [(None, 1.0)]
     for wavelength, weight in lines:
         traced = None
         for rays in sampler.chunks(chunk):
-            traced = Tracer(system, rays, dtype, requests, traced, weight=part * weight, wavelength=wavelength)
+            traced = Tracer(system, rays, dtype, requests, traced, weight=fraction * weight, wavelength=wavelength)
             yield traced
 
 
 def _total(
-    parts: Iterator[Tracer], parameters: Parameters, screens, shapes, filter: Filter, rays: int, device: str | torch.device
+    chunks: Iterator[Tracer], parameters: Parameters, screens, shapes, filter: Filter, rays: int, device: str | torch.device
 ) -> list[Image[float]]:
     """Sums over tracers, without derivatives: an image for each screen, from one trace of the rays."""
     images = [torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes]
     accounts, leaving = [dict.fromkeys(LOSSES, 0.0) for _ in screens], [0.0] * len(images)
     with torch.no_grad():
-        for traced in parts:
+        for traced in chunks:
             states = traced(parameters) if len(images) > 1 else None
             for k, screen in enumerate(screens):
-                part = traced.expose(parameters, screen, filter) if states is None else traced.collect(states, screen, filter)
-                images[k] += part.image
-                leaving[k] += float(part.leaving.sum())
-                for name, value in part.lost.items():
+                exposure = traced.expose(parameters, screen, filter) if states is None else traced.collect(states, screen, filter)
+                images[k] += exposure.image
+                leaving[k] += float(exposure.leaving.sum())
+                for name, value in exposure.lost.items():
                     accounts[k][name] += float(value)
     return [Image(*of, rays) for of in zip(images, leaving, accounts, strict=True)]
 

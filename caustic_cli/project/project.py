@@ -80,22 +80,23 @@ class Designed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Project:
-    """An opened project: its directory, complete settings, and target picture.
+    """An opened project: its directory, complete settings, and target picture."""
 
-    path: None for a project in memory; on_disk: whether its settings were read from
-    there; asked: digest of the user's input (`uptodate`); found: the checkpoint of an earlier design with the same input; hold:
-    context that releases the lock of the directory; without_waves: see `config.wave_stages.without_waves`; values: of the scene
-    parameters of a network, None for the middle of their ranges.
-    """
-
+    #: None for a project in memory.
     path: Path | None
     settings: Settings
     picture: Picture
+    #: Digest of the user's input, see `uptodate`.
     asked: str = ""
-    found: Checkpoint | None = None
+    #: Of an earlier design with the same input.
+    checkpoint: Checkpoint | None = None
+    #: Releases the lock of the directory.
     hold: ExitStack = field(default_factory=ExitStack, repr=False)
+    #: See `config.wave_stages.without_waves`.
     without_waves: str = ""
+    #: Whether its settings were read from the directory.
     on_disk: bool = False
+    #: Of the scene parameters of a network, None for the middle of their ranges.
     values: tuple[float, ...] | None = None
 
     @classmethod
@@ -183,9 +184,9 @@ class Project:
     def second_target(self, scene: Scene) -> np.ndarray | None:
         """The second target on its screen, (n_x, n_y), or None."""
         picture, section = self.second, self.settings.second
-        if picture is None or section is None or scene.second is None or scene.second.screen is None:
+        if picture is None or section is None or scene.second_target is None or scene.second_target.screen is None:
             return None
-        return target_on_screen(picture, section.size, scene.second.screen, self.settings.target.flip)
+        return target_on_screen(picture, section.size, scene.second_target.screen, self.settings.target.flip)
 
     def targets(self, scene: Scene) -> list[np.ndarray]:
         """The target of each lenslet on the screen of the scene, (n_x, n_y), j fastest; a single one for a common picture."""
@@ -251,8 +252,8 @@ class Project:
         """The lens of the last checkpoint, at the parameter values; given: path in `config.table` -> value, overriding settings."""
         scene = self.scene(given)
         target = self.target(scene)
-        scene, field, heights, found = self.lens(scene)
-        return LensData(scene, field, heights, target, dict(found.results), found.state, found.provenance)
+        scene, field, heights, checkpoint = self.lens(scene)
+        return LensData(scene, field, heights, target, dict(checkpoint.results), checkpoint.state, checkpoint.provenance)
 
     def refined_by_waves(self, state: State | None) -> bool:
         """Whether a design in this state was refined on its wave image."""

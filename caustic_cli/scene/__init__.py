@@ -51,25 +51,20 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Band:
-    """Light that one trace covers: one source, one refractive index and one state of polarisation.
-
-    weight: fraction of the total power; channel: colour channel of the image, None for an image without colours; member: index of
-    the source among several, None for a single one.
-    """
+    """Light that one trace covers: one source, one refractive index and one state of polarisation."""
 
     scene: Scene
+    #: Fraction of the total power.
     weight: float = 1.0
+    #: Colour channel of the image, None for an image without colours.
     channel: int | None = None
+    #: Index of the source among several, None for a single one.
     member: int | None = None
 
 
 @dataclass(frozen=True)
 class Scene:
     """Source, lens and screen on one optical axis (z); lengths in mm, powers in the unit of `light`.
-
-    second: what the light must do behind the screen, for a lens with two free-form sides.
-    elements: other lenses and fold mirrors, in the order in which light reaches them; behind a mirror, z and the screen refer to
-    the folded axis.
 
     Raises:
         InputError: the screen is not behind the lens, or the source not in front of it; a curved screen is larger than its sphere
@@ -80,13 +75,16 @@ class Scene:
     lens: Lens
     screen: Screen
     light: Light = field(default_factory=Light)
-    second: SecondTarget | None = None
+    #: What the light must do behind the screen, for a lens with two free-form sides.
+    second_target: SecondTarget | None = None
+    #: Other lenses and fold mirrors, in the order in which light reaches them; behind a mirror, z and the screen refer to the
+    #: folded axis.
     elements: tuple[Component, ...] = ()
 
     def __post_init__(self):
         self._check_elements()
-        if self.second is not None:
-            self.second.check(self.screen)
+        if self.second_target is not None:
+            self.second_target.check(self.screen)
         self.lens.interaction.check_screen(self.screen.z, self.lens.z_in)
         self.screen.check_curvature()
         if self.source.nearest >= self.lens.z_in:
@@ -107,23 +105,23 @@ class Scene:
     @property
     def second_setting(self) -> str:
         """Path of the setting by which a lens has two free-form sides."""
-        return "second.file" if self.second is None else self.second.setting
+        return "second.file" if self.second_target is None else self.second_target.setting
 
     @property
-    def before(self) -> tuple[Component, ...]:
+    def in_front(self) -> tuple[Component, ...]:
         """The elements in front of the lens, in the order in which light reaches them."""
         return tuple(e for e in self.elements if e.z < self.lens.z_in)
 
     @property
     def behind(self) -> tuple[Component, ...]:
         """The elements behind the lens."""
-        return self.elements[len(self.before) :]
+        return self.elements[len(self.in_front) :]
 
     @property
     def free_surfaces(self) -> tuple[str, ...]:
         """Names of the free-form surfaces that a design optimises, the lens' exit last."""
         beside = [surface_name(k, side) for k, e in enumerate(self.elements) for side in e.free_sides]
-        return (*(["entrance"] if self.second is not None else beside), "exit")
+        return (*(["entrance"] if self.second_target is not None else beside), "exit")
 
     @property
     def joint(self) -> bool:
@@ -133,12 +131,12 @@ class Scene:
     @property
     def pupil(self) -> Pupil:
         """The aperture that the source illuminates: the lens' entrance, or the first element in front of it."""
-        return next(iter(self.before), self.lens).pupil
+        return next(iter(self.in_front), self.lens).pupil
 
     @property
     def lowest(self) -> float:
         """Lower bound of z over the first surface that light reaches, mm."""
-        return min([e.extent[0] for e in self.before[:1]] + [self.lens.lowest])
+        return min([e.extent[0] for e in self.in_front[:1]] + [self.lens.lowest])
 
     @property
     def glasses(self) -> tuple[str, ...]:
@@ -154,21 +152,21 @@ class Scene:
     @property
     def axial(self) -> bool:
         """Whether all light inside the lens is parallel to the axis."""
-        return self.source.collimated and not self.two_sided and self.lens.gradient is None and not self.before
+        return self.source.collimated and not self.two_sided and self.lens.gradient is None and not self.in_front
 
-    def part(self, k: int, of: int) -> Scene:
-        """The scene with the k-th of `of` statistically independent parts of its light: the rays of a ray file are partitioned, the
-        rays of any other source are sampled afresh."""
-        return replace(self, source=self.source.part(k, of))
+    def batch(self, k: int, of: int) -> Scene:
+        """The scene with the k-th of `of` statistically independent batches of its light: the rays of a ray file are partitioned,
+        the rays of any other source are sampled afresh."""
+        return replace(self, source=self.source.batch(k, of))
 
     def onto(self, screen: Screen) -> Scene:
         """The scene with another screen and without a second target."""
-        return replace(self, screen=screen, second=None)
+        return replace(self, screen=screen, second_target=None)
 
     @property
     def two_sided(self) -> bool:
         """Whether the entrance is free-form as well as the exit."""
-        return self.second is not None or self.lens.entrance is not None
+        return self.second_target is not None or self.lens.entrance is not None
 
     @property
     def dispersive(self) -> bool:
@@ -187,8 +185,8 @@ class Scene:
             return (self,)
         spectra = self.source.spectra if self.light.wavelengths else [((), ())] * len(self.source.members)
         return tuple(
-            replace(self, source=one, light=replace(self.light, wavelengths=wavelengths, weights=weights))
-            for one, (wavelengths, weights) in zip(self.source.members, spectra, strict=True)
+            replace(self, source=member, light=replace(self.light, wavelengths=wavelengths, weights=weights))
+            for member, (wavelengths, weights) in zip(self.source.members, spectra, strict=True)
         )
 
     @property
@@ -208,7 +206,7 @@ class Scene:
                 return (Band(self),)
             return tuple(Band(replace(self, light=Light(state)), 1.0 / len(states)) for state in states)
         bands = []
-        for wavelength, part, channel in zip(self.light.wavelengths, self.light.parts, self.light.channels, strict=True):
+        for wavelength, part, channel in zip(self.light.wavelengths, self.light.fractions, self.light.channels, strict=True):
             scene = self.at(wavelength) if self.dispersive else self
             bands += [Band(replace(scene, light=Light(state)), part / len(states), channel) for state in states]
         return tuple(bands)

@@ -27,12 +27,9 @@ def _library(array) -> Any:
 
 @dataclass(frozen=True)
 class Aperture:
-    """The clear aperture of a surface: a rectangle centred on the element's axis; infinite for an unbounded surface.
+    """The clear aperture of a surface: a rectangle centred on the element's axis; infinite for an unbounded surface."""
 
-    Args:
-        half_size: half widths, mm.
-    """
-
+    #: Half widths, mm.
     half_size: tuple[float, float] = (math.inf, math.inf)
 
     #: Its name among the settings; whether it is a circle, for compiled loops, which take no objects.

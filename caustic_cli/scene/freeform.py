@@ -14,14 +14,11 @@ from caustic_cli.scene.screen import Screen
 
 @dataclass(frozen=True, eq=False)
 class FreeForm:
-    """A free-form surface with known control heights: a B-spline height field over an aperture.
+    """A free-form surface with known control heights: a B-spline height field over an aperture."""
 
-    Args:
-        heights: (n, m) control heights above the vertex plane, mm.
-        degree, knots: as for `Lens`.
-    """
-
+    #: (n, m) control heights above the vertex plane, mm.
     heights: np.ndarray
+    #: As for `Lens`.
     degree: tuple[int, int]
     knots: tuple[Sequence[float], Sequence[float]] | None = None
 
@@ -32,15 +29,13 @@ class SecondTarget:
 
     It takes two free-form surfaces: one determines where light arrives, two also determine its direction there.
 
-    Args:
-        screen: screen of the second picture; None for collimated or focused light.
-        focus: (x, y, z), mm; None for collimated light, or a second picture.
-
     Raises:
         InputError: both are given, or a value is out of range.
     """
 
+    #: Screen of the second picture; None for collimated or focused light.
     screen: Screen | None = None
+    #: (x, y, z), mm; None for collimated light, or a second picture.
     focus: tuple[float, float, float] | None = None
 
     def __post_init__(self):

@@ -27,17 +27,15 @@ DEGREE = 3
 class Gradient:
     """A gradient-index distribution; see the module.
 
-    Args:
-        kind: selfoc, radial, axial or volume.
-        terms: coefficients of a formula.
-        volume: (n, m, k) or (n, m) float64 control values.
-
     Raises:
         InputError: the kind is unknown, the number of terms is wrong, or the volume is invalid.
     """
 
+    #: selfoc, radial, axial or volume.
     kind: str
+    #: Coefficients of a formula.
     terms: tuple[float, ...] = ()
+    #: (n, m, k) or (n, m) float64 control values.
     volume: np.ndarray | None = None
 
     def __post_init__(self):

@@ -26,15 +26,12 @@ from caustic_cli.scene.interaction import Interior, Reflecting, Refracting
 
 @dataclass(frozen=True)
 class Offset:
-    """The base surface f(x, y) = thickness + sag_x(x) + sag_y(y).
+    """The base surface f(x, y) = thickness + sag_x(x) + sag_y(y)."""
 
-    Args:
-        thickness: f(0, 0), mm.
-        radius: (rho_x, rho_y) mm, inf for flat.  Equal and finite radii give the sphere of table 6.1,
-            thickness + rho - sqrt(rho^2 - x^2 - y^2); different ones the sum of two circular profiles.
-    """
-
+    #: f(0, 0), mm.
     thickness: float = 5.0
+    #: (rho_x, rho_y) mm, inf for flat.  Equal and finite radii give the sphere of table 6.1, thickness + rho - sqrt(rho^2 - x^2 -
+    #: y^2); different ones the sum of two circular profiles.
     radius: tuple[float, float] = (math.inf, math.inf)
 
     def __post_init__(self):
@@ -101,50 +98,47 @@ def array_control(n: int, degree: int, lenslets: int) -> int:
 class Lens:
     """A lens with a plane or free-form entrance and a B-spline exit, in air; or a free-form mirror.
 
-    Args:
-        size: full width and height of the aperture, mm.
-        z_in: position of the plane entrance, or of the reference plane of a free-form one, mm.
-        index: refractive index (the surroundings have 1).
-        control: control points along x and y.
-        degree: spline degrees along x and y.
-        knots: (knots_u, knots_v) on [0, 1], or None for open equispaced ones.
-        min_thickness: least distance of every control height from z_in, mm (4.1.2).
-        offset: base surface.
-        height_range: least and largest height above the base surface, mm (5.1.1).
-        fresnel: reflection losses at both surfaces: none, schlick or exact (unpolarised).
-        absorption: absorption coefficient a of the glass, 1/mm; the transmittance of t mm is exp(-a t) (Beer-Lambert).
-        roughness: standard deviation, along either axis, of the slopes of the exit's microfacets relative to the smooth surface.
-        glass: a dispersive material, by its name in `materials`; None for `index` at every wavelength.
-        aperture: rectangle, or circle, the largest that fits into the size; the spline is defined beyond it, light and glass end
-            there.
-        border: width of a dark rim around the aperture, which the exported solid has for its mount, mm.
-        array: numbers of lenslets along x and y, whose surfaces are continuous across their borders; (1, 1) is a single lens.
-        gradient: gradient-index distribution, with `index` for n_0 of its formula; None for a homogeneous lens.
-        mirror: the free-form surface reflects, in air; `index`, `fresnel` and `absorption` are ignored.
-        entrance: the free-form entrance; None for a plane one.
-
     Raises:
         InputError: a value is out of range, or two contradict each other.
     """
 
+    #: Full width and height of the aperture, mm.
     size: tuple[float, float] = default("lens.size")
+    #: Position of the plane entrance, or of the reference plane of a free-form one, mm.
     z_in: float = default("lens.z_in")
+    #: Refractive index (the surroundings have 1).
     index: float = default("lens.index")
+    #: Control points along x and y.
     control: tuple[int, int] = (50, 50)
+    #: Spline degrees along x and y.
     degree: tuple[int, int] = default("lens.degree")
+    #: (knots_u, knots_v) on [0, 1], or None for open equispaced ones.
     knots: tuple[Sequence[float], Sequence[float]] | None = None
+    #: Least distance of every control height from z_in, mm (4.1.2).
     min_thickness: float = 0.0
+    #: Base surface.
     offset: Offset = field(default_factory=Offset)
+    #: Least and largest height above the base surface, mm (5.1.1).
     height_range: tuple[float, float] = (-1.0, 1.0)
+    #: Reflection losses at both surfaces: none, schlick or exact (unpolarised).
     fresnel: str = default("lens.fresnel")
+    #: Absorption coefficient a of the glass, 1/mm; the transmittance of t mm is exp(-a t) (Beer-Lambert).
     absorption: float = default("lens.absorption")
+    #: Standard deviation, along either axis, of the slopes of the exit's microfacets relative to the smooth surface.
     roughness: float = default("lens.roughness")
+    #: A dispersive material, by its name in `materials`; None for `index` at every wavelength.
     glass: str | None = None
+    #: The free-form surface reflects, in air; `index`, `fresnel` and `absorption` are ignored.
     mirror: bool = default("lens.mirror")
+    #: rectangle, or circle, the largest that fits into the size; the spline is defined beyond it, light and glass end there.
     aperture: str = default("lens.aperture")
+    #: Width of a dark rim around the aperture, which the exported solid has for its mount, mm.
     border: float = default("lens.border")
+    #: Numbers of lenslets along x and y, whose surfaces are continuous across their borders; (1, 1) is a single lens.
     array: tuple[int, int] = default("lens.array")
+    #: The free-form entrance; None for a plane one.
     entrance: FreeForm | None = None
+    #: Gradient-index distribution, with `index` for n_0 of its formula; None for a homogeneous lens.
     gradient: Gradient | None = None
 
     def __post_init__(self):

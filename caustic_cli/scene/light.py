@@ -17,23 +17,21 @@ MAX_WAVELENGTHS = 99
 class Light:
     """Spectrum and polarisation of a source's light.
 
-    Args:
-        polarisation: direction of linear polarisation in the x-y plane, degrees from +x; None for unpolarised light.
-        wavelengths: nm; empty for monochromatic light at the wavelength of the lens' index.
-        weights: relative power at each wavelength; empty for equal power.
-        tracked: unpolarised light is traced as two orthogonal polarisations, since the entrance transmits s and p differently.
-        color: the wavelengths are red, green and blue, and the image has a channel for each.
-        unit: unit of the source's power: W (radiant flux) or lm (luminous flux).
-
     Raises:
         InputError: a value is out of range, or the numbers of wavelengths and weights do not match.
     """
 
+    #: Direction of linear polarisation in the x-y plane, degrees from +x; None for unpolarised light.
     polarisation: float | None = None
+    #: nm; empty for monochromatic light at the wavelength of the lens' index.
     wavelengths: tuple[float, ...] = ()
+    #: Relative power at each wavelength; empty for equal power.
     weights: tuple[float, ...] = ()
+    #: Unpolarised light is traced as two orthogonal polarisations, since the entrance transmits s and p differently.
     tracked: bool = False
+    #: The wavelengths are red, green and blue, and the image has a channel for each.
     color: bool = False
+    #: Unit of the source's power: W (radiant flux) or lm (luminous flux).
     unit: str = "W"
 
     def __post_init__(self):
@@ -71,7 +69,7 @@ class Light:
         return (len(RGB),) if self.color else ()
 
     @property
-    def parts(self) -> tuple[float, ...]:
+    def fractions(self) -> tuple[float, ...]:
         """Fraction of the power at each wavelength; they sum to 1."""
         weights = self.weights or (1.0,) * len(self.wavelengths)
         return tuple(w / sum(weights) for w in weights)

@@ -28,18 +28,20 @@ D_LINE, F_LINE, C_LINE = 587.5618, 486.1327, 656.2725
 
 @dataclass(frozen=True)
 class Material:
-    """An optical material.
+    """An optical material."""
 
-    sellmeier: terms (B_k, C_k), or cauchy: terms (A_k, p_k); range_nm: range of validity; source: reference; density: g/cm^3, None
-    if the reference gives none; also: other names; spread: of n_d between batches, 0 for catalogue glasses.
-    """
-
+    #: Reference.
     source: str
+    #: Range of validity.
     range_nm: tuple[float, float]
+    #: g/cm^3, None if the reference gives none.
     density: float | None
+    #: Terms (B_k, C_k), or cauchy: terms (A_k, p_k).
     sellmeier: tuple[tuple[float, float], ...] = ()
     cauchy: tuple[tuple[float, float], ...] = ()
+    #: Other names.
     also: tuple[str, ...] = ()
+    #: Of n_d between batches, 0 for catalogue glasses.
     spread: float = 0.0
 
     def index(self, wavelength: float) -> float:

@@ -53,27 +53,25 @@ class Sags:
 class Screen:
     """Pixels [i, j], i along +x, j along +y, on [-R_x, R_x] x [-R_y, R_y] at z (thesis 3.1.1).
 
-    Args:
-        size: full width and height (2 R_x, 2 R_y), mm.
-        z: position, mm.
-        resolution: pixels along x and y.
-        tilt: right-handed rotations of the screen about its own centre, first about the fixed x axis, then about the fixed y axis,
-            degrees.
-        shift: decentre of the screen along x and y, mm.
-        radius: radii of curvature along x and y, mm: equal for a sphere, one of them inf for a cylinder; positive if the centre of
-            curvature lies on the side of the normal, so that the edges bend that way.
-        sags: a measured shape instead.
-
     Raises:
         InputError: a value is out of range, or the radii are those of neither a sphere nor a cylinder.
     """
 
+    #: Full width and height (2 R_x, 2 R_y), mm.
     size: tuple[float, float]
+    #: Position, mm.
     z: float = default("screen.z")
+    #: Pixels along x and y.
     resolution: tuple[int, int] = (250, 250)
+    #: Right-handed rotations of the screen about its own centre, first about the fixed x axis, then about the fixed y axis,
+    #: degrees.
     tilt: tuple[float, float] = default("screen.tilt")
+    #: Decentre of the screen along x and y, mm.
     shift: tuple[float, float] = default("screen.shift")
+    #: Radii of curvature along x and y, mm: equal for a sphere, one of them inf for a cylinder; positive if the centre of curvature
+    #: lies on the side of the normal, so that the edges bend that way.
     radius: tuple[float, float] = PLANE
+    #: A measured shape instead.
     sags: Sags | None = None
 
     def __post_init__(self):

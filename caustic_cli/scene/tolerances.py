@@ -76,14 +76,13 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class FormError:
-    """A random form error.
+    """A random form error."""
 
-    rms: mm, over all realisations; exponent: of its two-dimensional power spectral density; longest, shortest: its range of spatial
-    wavelengths, mm, longest None for the lens' larger side.
-    """
-
+    #: mm, over all realisations.
     rms: float
+    #: Of its two-dimensional power spectral density.
     exponent: float = 2.0
+    #: Its range of spatial wavelengths, mm, longest None for the lens' larger side.
     longest: float | None = None
     shortest: float = 1.0
 
@@ -154,14 +153,14 @@ class Tolerances:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The random variables with a width above 0."""
-        found = []
+        parameters = []
         for error in self.errors:
             kind = KINDS[error.name]
             for axis, (label, width) in enumerate(zip(kind.axes, error.width, strict=True)):
                 if width > 0:
                     name = f"{error.name} {label}".strip()
-                    found.append(Parameter(name, error.name, axis, kind.unit, error.distribution, width))
-        return tuple(found)
+                    parameters.append(Parameter(name, error.name, axis, kind.unit, error.distribution, width))
+        return tuple(parameters)
 
     @property
     def surface(self) -> tuple[str, ...]:

@@ -95,7 +95,7 @@ def converge(
         CausticError: MOST_RAYS or those of a file are not enough, or no light reaches the screen.
     """
     each, traced, order = max(1, rays // BATCHES), 0, ORDER if scene.source.collimated else SOBOL_ORDER
-    available, lights = _available(scene), [scene.part(k, BATCHES) for k in range(BATCHES)]
+    available, lights = _available(scene), [scene.batch(k, BATCHES) for k in range(BATCHES)]
     while True:
         if each * BATCHES > available:
             raise CausticError(f"⟨tolerance⟩ {tolerance:g} requires more rays than the file holds, {available:,}")
@@ -213,7 +213,7 @@ def _in_halves(
     """The mean of two independent halves of about `rays` rays, with its figures; of more where `quiet` requires them, see
     `retrace`.  trace: images by name of the random numbers, number of rays and scene."""
     parts: tuple[list[Image], list[Image]] = [], []
-    lights = [scene.part(k, 2) for k in (0, 1)]
+    lights = [scene.batch(k, 2) for k in (0, 1)]
     while True:
         for k in range(len(parts[0]), max(1, 2 * len(parts[0]))):
             for part, name, light in zip(parts, ("render", "render, other half"), lights, strict=True):

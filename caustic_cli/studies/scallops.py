@@ -39,7 +39,7 @@ def scallops(scene: Scene, step: float, radius: float) -> dict:
     bend, throw = abs(lens.effective_index - 1.0), abs(screen.z - lens.offset.thickness)
     pixel = max(screen.pixel)
     said = scene.light.wavelengths
-    wavelength = sum(w * p for w, p in zip(said, scene.light.parts, strict=True)) if said else GREEN
+    wavelength = sum(w * p for w, p in zip(said, scene.light.fractions, strict=True)) if said else GREEN
     blur = bend * throw * step / radius
     phase = 2.0 * math.pi * bend * PARABOLA / (wavelength * 1e-6)  # standard deviation, rad, per mm of depth
     fine = PIXELS * pixel * radius / (bend * throw)

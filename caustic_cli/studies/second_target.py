@@ -38,7 +38,7 @@ def second_figures(
         figures: second_relative_rms, second_noise, second_on_target, second_on_screen and second_of_source of a second picture;
         angle_rms_mrad, the RMS angle to the prescribed directions, weighted by power, for collimated or focused light.
     """
-    second = scene.second
+    second = scene.second_target
     assert second is not None
     if second.screen is not None:
         elsewhere = scene.onto(second.screen)

@@ -56,7 +56,7 @@ class NetworkDesign:
         seed: int,
     ):
         self.designers, self.target, self.rays, self.seed = designers, target, rays, seed
-        self.states = [one.begin(*first or ()) for one in designers]
+        self.states = [one.initial_state(*first or ()) for one in designers]
         held = [state.parameters or {"heights": state.heights} for state in self.states]  # free heights are the parameters
         count = sum(v.numel() for parameters in held for name, v in parameters.items() if name != "start")
         self.about = about | {"parameters": count}

@@ -70,10 +70,10 @@ class TimedDesign:
     def _begin(self, target: Tensor) -> State:
         """The initial state, with the time of its computation."""
         if self.series != TRANSPORT:
-            return self.designer.begin()
+            return self.designer.initial_state()
         began = time.monotonic()
         first = first_surface(self.designer.scene, target.numpy(), self.designer.field(0)).heights
-        return replace(self.designer.begin(first), seconds=time.monotonic() - began)
+        return replace(self.designer.initial_state(first), seconds=time.monotonic() - began)
 
     @property
     def field(self) -> HeightField:

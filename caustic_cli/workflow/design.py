@@ -63,7 +63,7 @@ NO_MOVIE = NoMovie()
 QUICK, RARELY = 0.5, 10.0
 
 
-class Begun(NamedTuple):
+class PreparedDesign(NamedTuple):
     """A design about to be run: its project, its problem, None where it exists already, and its initial heights, None for the
     offset surface."""
 
@@ -77,7 +77,7 @@ class Begun(NamedTuple):
         return self.project.scene() if self.problem is None else self.problem.scene
 
 
-def begin(
+def prepare(
     target: Path | Piped | Picture,
     given: Mapping[str, Any],
     *,
@@ -88,10 +88,10 @@ def begin(
     recorded: bool = False,
     say: Reporter,
     device: str = "cpu",
-) -> Begun:
+) -> PreparedDesign:
     """Validate all input, then create the project directory, if any.
 
-    If the same design exists already, finished or not, its project is opened instead (`Project.found`).
+    If the same design exists already, finished or not, its project is opened instead (`Project.checkpoint`).
 
     Args:
         given: path in `config.table` -> value, including derived parameters such as "mag".
@@ -110,7 +110,7 @@ def begin(
         raise InputError(kind.no_movie)
     if out is not None and not force:
         if same := uptodate.same_design(out, project.asked):
-            return Begun(replace(same[0], found=same[1]))
+            return PreparedDesign(replace(same[0], checkpoint=same[1]))
         force = uptodate.is_begun(out, project.asked)  # and interrupted before the first checkpoint: it is begun anew
     problem = kind.of(project, device)  # builds and thereby validates scene, target, stages, options
     problem.refuse_obstructed()
@@ -125,28 +125,28 @@ def begin(
         say.notify_if_slow("solving the transport of the light to the picture"),
     ):
         try:
-            begun = first_heights(project, said, problem)
+            prepared = first_heights(project, said, problem)
         except OutOfReach as error:
             most = largest_magnification(problem.scene, project.settings.target.size)
             most = min(most or 0.0, TABLE["mag"].high)
             within = f"; ⟨+mag⟩ of at most about {at_most(most, 2)} is within reach at this throw" if most else ""
             raise InputError(f"{error}{within}") from error
     if out is not None:
-        directory.create(begun.project, force)
-    return begun
+        directory.create(prepared.project, force)
+    return prepared
 
 
-def first_heights(project: Project, said: Given, problem: OneSurface) -> Begun:
+def first_heights(project: Project, said: Given, problem: OneSurface) -> PreparedDesign:
     """The initial heights of a design; and its project and problem with thickness and height range adapted to them, except for
     values `said` by the user.
 
     Raises:
-        InputError: as of `begin`.
+        InputError: as of `prepare`.
     """
     fixed = "thickness" in said.get("lens", {})
     first, middle = _solved(project, problem, fixed)
     if not problem.adapts:
-        return Begun(project, problem, Designer(problem).initial_heights(first))
+        return PreparedDesign(project, problem, Designer(problem).initial_heights(first))
     if middle is not None:
         project, problem = _with_lens(project, problem, thickness=middle)
     if first is not None and not fixed and (spare := _spare(project.settings.lens, said, first)) > 0:
@@ -157,7 +157,7 @@ def first_heights(project: Project, said: Given, problem: OneSurface) -> Begun:
         project, problem = _with_lens(project, problem, **room)
         if middle is None:
             first, _ = _solved(project, problem, fixed)
-    return Begun(project, problem, Designer(problem).initial_heights(first))
+    return PreparedDesign(project, problem, Designer(problem).initial_heights(first))
 
 
 def _with_lens(project: Project, problem: OneSurface, **values: Any) -> tuple[Project, OneSurface]:
@@ -169,38 +169,37 @@ def _with_lens(project: Project, problem: OneSurface, **values: Any) -> tuple[Pr
 
 @dataclass(frozen=True)
 class Result:
-    """A finished design: its project, its lens, and the figures of the JSON table.
-
-    scene: with the designed entrance, if that is free-form; heights: (n, m) mm of the exit.
-    """
+    """A finished design: its project, its lens, and the figures of the JSON table."""
 
     project: Project
+    #: With the designed entrance, if that is free-form.
     scene: Scene
     field: HeightField
+    #: (n, m) mm of the exit.
     heights: torch.Tensor
     target: np.ndarray
     state: State
     figures: dict[str, Any]
 
 
-def design(begun: Begun, device: str, say: Reporter, began: float, movie: NoMovie = NO_MOVIE) -> Result:
+def design(prepared: PreparedDesign, device: str, say: Reporter, began: float, movie: NoMovie = NO_MOVIE) -> Result:
     """Run a new design from its initial heights to its end; movie: records it.
 
-    A finished design found by `begin` is returned; an unfinished one is continued.
+    A finished design found by `prepare` is returned; an unfinished one is continued.
     """
-    project, problem, first = begun
+    project, problem, first = prepared
     if problem is None:
         return _again(project, device, say, began, movie)
     with project.hold:
         if not problem.in_stages:
             return _run_index(project, problem, say, began)
         _say_limits(project, problem, first, say)
-        return _run(project, problem, Designer(problem).begin(*first or ()), say, began, None, movie)
+        return _run(project, problem, Designer(problem).initial_state(*first or ()), say, began, None, movie)
 
 
 def _again(project: Project, device: str, say: Reporter, began: float, movie: NoMovie) -> Result:
-    """The result of a design found by `begin`."""
-    figures = uptodate.finished(project, project.found)
+    """The result of a design found by `prepare`."""
+    figures = uptodate.finished(project, project.checkpoint)
     anew = kind_of(project.settings).no_resume
     say.say(
         f"{project.path}: was designed from the same picture with the same options, so "
@@ -214,8 +213,8 @@ def _again(project: Project, device: str, say: Reporter, began: float, movie: No
     )
     if not figures and anew:
         project.hold.enter_context(directory.locked(project.path))
-        project = replace(project, asked=uptodate.asked_of(project, project.found), found=None)
-        return design(Begun(project, problem_of(project, device)), device, say, began)
+        project = replace(project, asked=uptodate.asked_of(project, project.checkpoint), checkpoint=None)
+        return design(PreparedDesign(project, problem_of(project, device)), device, say, began)
     if not figures:
         return resume(project, None, None, device, say, began, movie)
     movie.unused(say)
@@ -233,7 +232,7 @@ def _say_limits(project: Project, problem: OneSurface, first: InitialHeights | N
     size, timed = project.settings.target.size, math.isfinite(chosen.time_limit)
     for words in problem.notes(size, timed, project.without_waves if chosen.waves == "auto" else ""):
         say.say(words)
-    heights = Designer(problem).begin().heights if first is None else first.heights
+    heights = Designer(problem).initial_state().heights if first is None else first.heights
     nets = 3 if first is not None and first.unrounded is not None else 2
     for words in problem.preview(heights, nets * expected_bytes(heights.numel())):
         say.say(words)
@@ -256,19 +255,19 @@ def resume(
         problem = problem_of(project, device)
         problem.refuse_obstructed()
         designer = Designer(problem)
-        begun = (project.path / CHECKPOINT).exists()  # else it was killed before its first checkpoint
-        before = project.load() if begun else None
-        if begun:
-            state = before.state
+        has_checkpoint = (project.path / CHECKPOINT).exists()  # else it was killed before its first checkpoint
+        checkpoint = project.load() if has_checkpoint else None
+        if has_checkpoint:
+            state = checkpoint.state
         else:
-            state = designer.begin(*designer.initial_heights(_solved(project, problem, fixed=True)[0]) or ())
+            state = designer.initial_state(*designer.initial_heights(_solved(project, problem, fixed=True)[0]) or ())
         _refuse_edited(project, designer, state)
         state = designer.restored(state)
         if iterations is not None:
             changed = project.settings.design.changed(iterations=iterations)
             project = replace(project, settings=project.settings.changed(design=changed))
             project.write_settings()
-        project = replace(project, asked=uptodate.asked_of(project, before) if begun else uptodate.begun(project))
+        project = replace(project, asked=uptodate.asked_of(project, checkpoint) if has_checkpoint else uptodate.begun(project))
         return _run(project, problem, state, say, began, time_limit, movie)
 
 
@@ -337,8 +336,8 @@ def _solved(project: Project, problem: OneSurface, fixed: bool) -> tuple[torch.T
     if start == "offset":
         return problem.offset(), None
     if start == "transport":
-        found = problem.transport(fixed, START_PART * project.settings.design.time_limit)
-        return found.heights, found.middle
+        surface = problem.transport(fixed, START_PART * project.settings.design.time_limit)
+        return surface.heights, surface.middle
     net = problem.field(0)
     if Path(start).suffix.lower() in surfaces.SUFFIXES and not Path(start).is_dir():
         return surfaces.onto(*surfaces.read_surface(start, net.half_size), net), None
@@ -451,11 +450,11 @@ def _run(
             watch.keep_if_due(state)
             state.heights = rounded(designer.within_limits(state))
         with say.waiting("evaluation with independent rays", evaluation_seconds(designer, state)):
-            found = evaluate_and_write(project, designer, state, timed)
-        made = manufacture.wall_and_stock(problem.scene, designer.field(found.state.stage), designer.exit(found.state))
-        result = _finished(project, designer, found, made, began, records)
-        shown = found.image if found.waves is None else found.waves
-        result = replace(result, figures=result.figures | movie.finish(shown, found.figures, say))
+            evaluated = evaluate_and_write(project, designer, state, timed)
+        made = manufacture.wall_and_stock(problem.scene, designer.field(evaluated.state.stage), designer.exit(evaluated.state))
+        result = _finished(project, designer, evaluated, made, began, records)
+        shown = evaluated.image if evaluated.waves is None else evaluated.waves
+        result = replace(result, figures=result.figures | movie.finish(shown, evaluated.figures, say))
         if asked:
             raise Interrupted(f"interrupted after the design had ended; {project.path} is complete", 128 + asked[0])
     if not timed and (words := problem.advice(project.settings.target.size)):
@@ -475,20 +474,20 @@ def _run_index(project: Project, problem: OneSurface, say: Reporter, began: floa
         if project.path is not None:
             project.write()
         designer = Designer(problem_of(project, problem.device))
-        found = evaluate_and_write(project, designer, state, math.isfinite(chosen.time_limit))
+        evaluated = evaluate_and_write(project, designer, state, math.isfinite(chosen.time_limit))
         figures = {"index_least": float(np.min(values)), "index_most": float(np.max(values))}
-        result = _finished(project, designer, found, figures, began, _Records(project, designer))
+        result = _finished(project, designer, evaluated, figures, began, _Records(project, designer))
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is complete", 128 + asked[0])
     return result
 
 
 def _finished(
-    project: Project, designer: Designer, found: Evaluated, more: dict[str, Any], began: float, records: _Records
+    project: Project, designer: Designer, evaluated: Evaluated, more: dict[str, Any], began: float, records: _Records
 ) -> Result:
     """The result of an evaluated design, with `more` figures, which is saved."""
-    state = found.state
-    figures = found.figures | more
+    state = evaluated.state
+    figures = evaluated.figures | more
     figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "reason": state.reason}
     if project.path is not None:
         figures |= uptodate.made_by(project, figures.get("wave_relative_rms") is not None)
@@ -555,9 +554,9 @@ def _signals(collect: bool = True) -> Iterator[list[int]]:
             raise KeyboardInterrupt
         asked.append(number)
 
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield asked
     finally:
-        for number, old in before.items():
+        for number, old in previous.items():
             signal.signal(number, old)

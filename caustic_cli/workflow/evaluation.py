@@ -36,21 +36,21 @@ BACKWARD = 2.5
 def evaluate_and_write(project: Project, designer: Designer, state: State, timed: bool = False) -> Evaluated:
     """Evaluate the finished lens; write render.png, wave.png and report.png into the project, if it has a directory."""
     target = designer.problem.target.numpy()
-    found = designer.problem.evaluate(designer, state, project.settings.target.size, timed)
+    evaluated = designer.problem.evaluate(designer, state, project.settings.target.size, timed)
     if project.path is None:
-        return found
+        return evaluated
     encoding = project.settings.target.encoding
-    seen, aim = (irradiance(a, designer.scene.screen) for a in (found.image, target))
-    made = uptodate.image_provenance(project, found.state.heights, found.figures)
+    seen, aim = (irradiance(a, designer.scene.screen) for a in (evaluated.image, target))
+    made = uptodate.image_provenance(project, evaluated.state.heights, evaluated.figures)
     write_image(project.path / RENDER, seen, white_level(seen, aim), encoding, WIDE, made)
     discard(project.path / WAVE)  # of an earlier lens
-    if found.waves is not None:
-        write_image(project.path / WAVE, found.waves, white_level(found.waves, target), encoding, WIDE)
+    if evaluated.waves is not None:
+        write_image(project.path / WAVE, evaluated.waves, white_level(evaluated.waves, target), encoding, WIDE)
     discard(project.path / FARTHER)
-    if found.farther is not None:
-        write_image(project.path / FARTHER, found.farther[0], white_level(*found.farther), encoding, WIDE)
+    if evaluated.farther is not None:
+        write_image(project.path / FARTHER, evaluated.farther[0], white_level(*evaluated.farther), encoding, WIDE)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
-    surface = _surface(designer.field(found.state.stage), designer.exit(found.state))
+    surface = _surface(designer.field(evaluated.state.stage), designer.exit(evaluated.state))
     design_report.write_report(
         project.path / REPORT,
         grey(aim),
@@ -59,12 +59,12 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
         history,
         designer.scene.lens,
         designer.scene.screen,
-        found.figures,
+        evaluated.figures,
         encoding,
-        None if found.waves is None else grey(found.waves),
+        None if evaluated.waves is None else grey(evaluated.waves),
         [(stage.rendering.blur, bool(stage.waves)) for stage in designer.stages],
     )
-    return found
+    return evaluated
 
 
 def expected_seconds(designer: Designer, state: State) -> float:

@@ -45,25 +45,23 @@ class Render(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A lens in its scene.
+    """A lens in its scene."""
 
-    Attributes:
-        scene: source, lens, screen.
-        field: spline spaces of the exit surface over the aperture.
-        heights: its control heights (n, m), mm, float64.
-        target: (n_x, n_y) or (3, n_x, n_y) on the screen's pixels, None for an archive.
-        figures: of the evaluation of the design with independent rays; empty for an unfinished design.
-        origin: the project or the archive that it comes from.
-        state: of the design; provenance: of that, see `workflow.design.provenance`.
-    """
-
+    #: Source, lens, screen.
     scene: Scene
+    #: Spline spaces of the exit surface over the aperture.
     field: HeightField
+    #: Its control heights (n, m), mm, float64.
     heights: Tensor
+    #: (n_x, n_y) or (3, n_x, n_y) on the screen's pixels, None for an archive.
     target: np.ndarray | None
+    #: Of the evaluation of the design with independent rays; empty for an unfinished design.
     figures: dict[str, Any]
+    #: The project or the archive that it comes from.
     origin: Project | ArchivedLens
+    #: Of the design.
     state: State | None = None
+    #: Of that, see `workflow.design.provenance`.
     provenance: dict[str, Any] | None = None
 
     def surface(self, x: Any, y: Any, side: str = "exit") -> tuple[np.ndarray, np.ndarray, np.ndarray]:

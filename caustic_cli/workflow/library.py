@@ -142,7 +142,7 @@ def design_of(
         InputError, CausticError: as in `design`.
     """
     began, recording = time.monotonic(), recorder(movie, force)
-    begun = workflow.begin(
+    prepared = workflow.prepare(
         Path(target) if isinstance(target, str) else target,
         given,
         preset=preset,
@@ -153,8 +153,8 @@ def design_of(
         say=say,
         device=device,
     )
-    compile_for(begun.scene, device, say, gradient=True)
-    return _lens(workflow.design(begun, device, say, began, recording), device)
+    compile_for(prepared.scene, device, say, gradient=True)
+    return _lens(workflow.design(prepared, device, say, began, recording), device)
 
 
 def resume(

@@ -68,15 +68,14 @@ class NoMovie:
 class Movie(NoMovie):
     """Records a design.
 
-    Args:
-        path: a .gif or .mp4; force: replace an existing file.
-
     Raises:
         InputError: it could not be written, see `io.movie.refuse_unwritable`.
     """
 
     recorded = True
+    #: A .gif or .mp4.
     path: Path
+    #: Replace an existing file.
     force: bool = False
     frames: list[Frame] = field(default_factory=list)
 

@@ -15,7 +15,7 @@ from caustic_cli.kinds import problem_of
 from caustic_cli.project.project import Project
 from caustic_cli.studies.efficiency import DesignedLens
 from caustic_cli.workflow.comparison import picture_of_disc
-from caustic_cli.workflow.design import Begun, first_heights
+from caustic_cli.workflow.design import PreparedDesign, first_heights
 
 #: Weights of the loss "light" relative to "rms", for distant sources, where thickness has no influence, and for near sources.
 DISTANT_WEIGHTS, NEAR_WEIGHTS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0), (0.0, 1.0, 10.0)
@@ -42,26 +42,26 @@ def lenses(project: Project | None, seconds: float, device: str) -> tuple[int, I
     cannot reach the picture are left out."""
     full = led() if project is None else project.settings
     near = not settings.build_source(full.source).distant and not full.lens.mirror
-    weights, parts = (NEAR_WEIGHTS, PARTS) if near else (DISTANT_WEIGHTS, (1.0,))
-    return len(weights) * len(parts), _designed(project, full, weights, parts, seconds, device)
+    weights, fractions = (NEAR_WEIGHTS, PARTS) if near else (DISTANT_WEIGHTS, (1.0,))
+    return len(weights) * len(fractions), _designed(project, full, weights, fractions, seconds, device)
 
 
-def _designed(project: Project | None, full: Settings, weights, parts, seconds: float, device: str) -> Iterator[DesignedLens]:
-    for part in parts:
-        thickness = full.lens.z_in + part * (full.lens.thickness - full.lens.z_in)
+def _designed(project: Project | None, full: Settings, weights, fractions, seconds: float, device: str) -> Iterator[DesignedLens]:
+    for fraction in fractions:
+        thickness = full.lens.z_in + fraction * (full.lens.thickness - full.lens.z_in)
         on_rays = [s for s in full.design.stages if not s.waves]
-        own = full.changed(lens=full.lens.changed(thickness=thickness), design=full.design.changed(waves="off", stages=on_rays))
+        varied = full.changed(lens=full.lens.changed(thickness=thickness), design=full.design.changed(waves="off", stages=on_rays))
         try:
-            begun = _begun(project, own, device)
+            prepared = _prepared(project, varied, device)
         except CausticError:
             continue
-        problem = begun.problem
+        problem = prepared.problem
         assert problem is not None
         for weight in weights:
             loss = f"rms + {weight:g} light" if weight else "rms"
             try:
                 designer = Designer(problem.varied(problem.stages, replace(problem.options, loss=loss, waves=False)))
-                state = designer.run(designer.begin(*begun.first or ()), time_limit=seconds)
+                state = designer.run(designer.initial_state(*prepared.first or ()), time_limit=seconds)
             except CausticError:
                 continue
             yield DesignedLens(
@@ -76,7 +76,7 @@ def _designed(project: Project | None, full: Settings, weights, parts, seconds: 
             )
 
 
-def _begun(project: Project | None, own: Settings, device: str) -> Begun:
+def _prepared(project: Project | None, varied: Settings, device: str) -> PreparedDesign:
     """The design with these settings, adapted to its initial heights."""
-    project = Project(None, own, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=own)
-    return first_heights(project, {"lens": {"thickness": own.lens.thickness}}, problem_of(project, device))
+    project = Project(None, varied, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=varied)
+    return first_heights(project, {"lens": {"thickness": varied.lens.thickness}}, problem_of(project, device))

@@ -270,8 +270,8 @@ def test_other_errors_are_not_taken_for_short_memory():
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory. Tried to allocate 2 GiB")])
 def test_memory_short_anywhere_is_one_sentence(error, monkeypatch, capfd):
-    def begin(*args, **options):
+    def prepare(*args, **options):
         raise error
 
-    monkeypatch.setattr(workflow, "begin", begin)
+    monkeypatch.setattr(workflow, "prepare", prepare)
     assert "out of memory" in run(DESIGN, capfd, 1)

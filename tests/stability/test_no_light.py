@@ -127,7 +127,7 @@ def test_a_bad_step_is_taken_back(optimizer, how, monkeypatch):
     """Said once; the run goes on, every state handed out is finite, and the loss still falls."""
     monkeypatch.setattr(problem, "Objective", type("H", (Holes,), {"bad": (3, 4, 8), "how": how}))
     d, said, states = small(optimizer, 0.02), [], []
-    state = d.run(d.begin(), iterations=12, notice=said.append, on_iteration=lambda s: states.append(s.heights.clone()))
+    state = d.run(d.initial_state(), iterations=12, notice=said.append, on_iteration=lambda s: states.append(s.heights.clone()))
     assert len(states) == 12 == len(state.history)
     assert len(said) == 1 and "was rejected" in said[0]
     assert all(bool(torch.isfinite(h).all()) for h in states)
@@ -139,11 +139,11 @@ def test_a_bad_step_is_taken_back(optimizer, how, monkeypatch):
 def test_adam_with_steps_far_too_long(network, compare):
     """A learning rate of 30 throws every ray off the screen at once: the steps are shortened, and light stays on it."""
     d, said = small("adam", 30.0, network, size=1.0), []
-    state = d.run(d.begin(), iterations=8, notice=said.append)
+    state = d.run(d.initial_state(), iterations=8, notice=said.append)
     assert bool(torch.isfinite(state.heights).all())
     assert all(row[3] > 0 and math.isfinite(row[2]) for row in state.history)
     assert said, "this case no longer meets a bad step"
-    naive = d.begin()
+    naive = d.initial_state()
     heights = d.problem.parametrised(0, naive.heights if network == "none" else None)
     objective = d.objective(0, heights)
     adam = torch.optim.Adam(heights.parameters(), lr=30.0)
@@ -163,7 +163,7 @@ def test_adam_with_steps_far_too_long(network, compare):
 def test_where_nothing_begins_it_stops_with_a_sentence():
     for optimizer in ("adam", "lbfgs"):
         d = small(optimizer)
-        state = d.begin()
+        state = d.initial_state()
         state.heights, state.parameters = prism(d.field(0), 0.79) - 15.0, {}
         d.scene = Scene(PlaneWave(), d.scene.lens, Screen((0.5, 0.5), 500.0, (12, 12)))
         with pytest.raises(CausticError, match="no light reaches the screen"):

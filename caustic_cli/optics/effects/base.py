@@ -28,19 +28,20 @@ NEGLIGIBLE = 0.01
 
 @dataclass(frozen=True)
 class Decision:
-    """The decision on an effect in a scene.
+    """The decision on an effect in a scene."""
 
-    name: of the effect; on: whether it is simulated; why: the reason, a clause; bound, limit: the deciding quantity and the value
-    that it is compared with, or None; fixed: whether the effect cannot be switched; present: False if the scene has no such effect
-    at all.
-    """
-
+    #: Of the effect.
     name: str
+    #: Whether it is simulated.
     on: bool
+    #: The reason, a clause.
     why: str
+    #: The deciding quantity and the value that it is compared with, or None.
     bound: float | None = None
     limit: float | None = None
+    #: Whether the effect cannot be switched.
     fixed: bool = False
+    #: False if the scene has no such effect at all.
     present: bool = True
 
 

@@ -19,7 +19,7 @@ class Entrance(GeneralRayEffect):
         angle, collimated = math.degrees(b.incidence), scene.source.collimated
         if scene.two_sided:
             return Decision(self.name, True, "the entrance is free-form", fixed=True)
-        if scene.before:
+        if scene.in_front:
             return Decision(self.name, True, f"other lenses send rays to it at up to {angle:.3g} degrees", angle, fixed=True)
         if collimated or scene.lens.mirror or angle == 0:
             why = "there is no glass before a mirror" if scene.lens.mirror else "normal incidence on a flat entrance bends nothing"

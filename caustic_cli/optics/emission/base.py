@@ -37,18 +37,16 @@ class Illuminated(Protocol):
 class Emission:
     """The rays of a source that is not collimated; subclasses implement the sampling.
 
-    Args:
-        scene: the illuminated scene or system, with a source of the matching type.
-        kind: sampler, one of `sampling.SAMPLERS`.
-        shape: cells (nu, nv) of each position, or of a distant source; all positions emit equally many rays.
-        seed, device: as for `Sampler`.
-
     dimensions: of the unit cube that is sampled; the first two are stratified in the cells.
     """
 
+    #: The illuminated scene or system, with a source of the matching type.
     scene: Illuminated
+    #: Sampler, one of `sampling.SAMPLERS`.
     kind: str
+    #: Cells (nu, nv) of each position, or of a distant source; all positions emit equally many rays.
     shape: tuple[int, int]
+    #: As for `Sampler`.
     seed: int = 0
     device: str | torch.device = "cpu"
 

@@ -31,13 +31,12 @@ RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 
 @dataclass(frozen=True)
 class Mode:
-    """One point of a source.
-
-    position: mm, for a near source; for a distant one the unit direction of its light; part: fraction of the source's power.
-    """
+    """One point of a source."""
 
     scene: Illuminated
+    #: mm, for a near source; for a distant one the unit direction of its light.
     position: tuple[float, float, float]
+    #: Fraction of the source's power.
     part: float
 
     def through(self, u: Tensor, v: Tensor, index: float = 1.0) -> RayState:

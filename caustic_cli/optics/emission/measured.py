@@ -40,20 +40,19 @@ SMOOTHED, WIDEST = 1000.0, 0.1
 class MeasuredRays:
     """The rays of a file, or a sample of them.
 
-    Args:
-        scene: the illuminated scene or system, with a ray-file source.
-        kind: sampler, one of `sampling.SAMPLERS`; ignored.
-        rays: largest number of rays.
-        seed: of the sample; device: of its tensors.
-
     Raises:
         InputError: no ray reaches the pupil.
     """
 
+    #: The illuminated scene or system, with a ray-file source.
     scene: Illuminated
+    #: Sampler, one of `sampling.SAMPLERS`; ignored.
     kind: str
+    #: Largest number of rays.
     rays: int
+    #: Of the sample.
     seed: int = 0
+    #: Of its tensors.
     device: str | torch.device = "cpu"
 
     def __post_init__(self):

@@ -17,12 +17,11 @@ SHIFTS = (0.7548776662466927, 0.5698402909980532)
 
 @dataclass(frozen=True, eq=False)
 class RegularGrid(Emission):
-    """Rays through the points of a regular grid on the pupil, offset by a fraction of a cell.
+    """Rays through the points of a regular grid on the pupil, offset by a fraction of a cell."""
 
-    mode: the source point; number: of the grid, which determines the offset.
-    """
-
+    #: The source point.
     mode: Mode | None = None
+    #: Of the grid, which determines the offset.
     number: int = 0
 
     @classmethod

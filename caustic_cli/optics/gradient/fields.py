@@ -172,17 +172,14 @@ class Luneburg(IndexField):
 
 @dataclass(frozen=True, eq=False)
 class SplineIndex(IndexField):
-    """A B-spline volume.
+    """A B-spline volume."""
 
-    Args:
-        coefficients: (n, m, k) float64 control values; a single value along an axis makes the field constant along it.
-        half_size, depth: of the box [-r_x, r_x] x [-r_y, r_y] x [0, depth], mm.
-        degree: along every axis, reduced where there are too few control values.
-    """
-
+    #: (n, m, k) float64 control values; a single value along an axis makes the field constant along it.
     coefficients: Tensor
+    #: Of the box [-r_x, r_x] x [-r_y, r_y] x [0, depth], mm.
     half_size: tuple[float, float]
     depth: float
+    #: Along every axis, reduced where there are too few control values.
     degree: int = DEGREE
 
     def __post_init__(self):

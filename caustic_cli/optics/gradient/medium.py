@@ -29,11 +29,9 @@ def index_name(element: Element) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class GradientMedium(Medium):
-    """A gradient-index medium.
+    """A gradient-index medium."""
 
-    gradient: its index field, scaled by the ratio of the glass' index at a wavelength to `index`.
-    """
-
+    #: Its index field, scaled by the ratio of the glass' index at a wavelength to `index`.
     gradient: IndexField
 
     varies: ClassVar[bool] = True

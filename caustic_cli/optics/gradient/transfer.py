@@ -32,20 +32,21 @@ ON_SURFACE, NEWTON, GUESSES = 1e-12, 12, 12
 
 
 class Transfer(NamedTuple):
-    """Rays at the next surface.
+    """Rays at the next surface."""
 
-    point, direction: in the medium's frame, three (N,) each, mm and unit vectors; n: index there; path, length: optical and
-    geometric path length, mm; slopes: of the surface, two (N,) or the number 0; found: whether the surface is reached; steps:
-    number of steps.
-    """
-
+    #: In the medium's frame, three (N,) each, mm and unit vectors.
     point: tuple
     direction: tuple
+    #: Index there.
     n: Tensor
+    #: Optical and geometric path length, mm.
     path: Tensor
     length: Tensor
+    #: Of the surface, two (N,) or the number 0.
     slopes: tuple
+    #: Whether the surface is reached.
     found: Tensor
+    #: Number of steps.
     steps: int
 
 

@@ -40,7 +40,7 @@ class SurfaceIntersection(NamedTuple):
     t: Tensor
     gx: Tensor | float
     gy: Tensor | float
-    found: Tensor
+    valid: Tensor
 
 
 class Surface(ABC, Generic[Heights]):
@@ -109,6 +109,6 @@ class MeasuredSurface(Surface[None]):
         if side > 0 and not any(isinstance(c, Tensor) for c in direction) and tuple(direction) == (0.0, 0.0, 1.0):
             x, y, oz = torch.broadcast_tensors(*(torch.as_tensor(c, dtype=torch.float64) for c in origin))
             z, gx, gy = self.at(None, x, y)
-            found = (x.abs() <= self.half_size[0]) & (y.abs() <= self.half_size[1]) & (z >= oz)
-            return SurfaceIntersection(z - oz, gx, gy, found)
+            valid = (x.abs() <= self.half_size[0]) & (y.abs() <= self.half_size[1]) & (z >= oz)
+            return SurfaceIntersection(z - oz, gx, gy, valid)
         return super().intersect(heights, origin, direction, side)

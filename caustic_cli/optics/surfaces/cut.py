@@ -23,17 +23,15 @@ BETWEEN = 1.2
 
 @dataclass(frozen=True, eq=False)
 class CutSurface(MeasuredSurface):
-    """The minimum of the envelopes of one or several tools over an aperture.
+    """The minimum of the envelopes of one or several tools over an aperture."""
 
-    Args:
-        envelopes: of each tool, in the program's coordinates.
-        half_size: half widths of the aperture, mm.
-        base: z of the program's origin in the scene, mm; turned: whether its Y and Z axes are reversed there.
-    """
-
+    #: Of each tool, in the program's coordinates.
     envelopes: tuple[Envelope, ...]
+    #: Half widths of the aperture, mm.
     half_size: tuple[float, float]
+    #: z of the program's origin in the scene, mm.
     base: float = 0.0
+    #: Whether its Y and Z axes are reversed there.
     turned: bool = False
 
     @cached_property

@@ -65,8 +65,8 @@ class Cylinder(Surface[None]):
         t = big_f / (big_g + side * root)
         b, z = bo + t * bd, oz + t * dz
         cosine = 1.0 - k * z
-        found = met & (t >= 0) & (cosine > math.sqrt(1.0 - EQUATOR**2)) & (side * (dz * cosine - k * b * bd) > 0)
+        valid = met & (t >= 0) & (cosine > math.sqrt(1.0 - EQUATOR**2)) & (side * (dz * cosine - k * b * bd) > 0)
         none = torch.zeros_like(t)
-        slope = torch.where(found, k * b / torch.where(found, cosine, torch.ones_like(t)), none)
+        slope = torch.where(valid, k * b / torch.where(valid, cosine, torch.ones_like(t)), none)
         slopes = (none, slope) if self.bent else (slope, none)
-        return SurfaceIntersection(torch.where(found, t, none), *slopes, found)
+        return SurfaceIntersection(torch.where(valid, t, none), *slopes, valid)

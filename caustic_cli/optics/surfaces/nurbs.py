@@ -21,14 +21,11 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 
 @dataclass(frozen=True, eq=False)
 class Nurbs(Surface[Tensor]):
-    """A rational height field.
+    """A rational height field."""
 
-    Args:
-        field: spline spaces and half widths of numerator and denominator.
-        weights: (n, m), positive.
-    """
-
+    #: Spline spaces and half widths of numerator and denominator.
     field: HeightField
+    #: (n, m), positive.
     weights: Tensor
 
     def __post_init__(self):

@@ -35,5 +35,5 @@ class Plane(Surface[None]):
         oz, dz = (torch.as_tensor(c, dtype=like.dtype, device=like.device) for c in (origin[2], direction[2]))
         ahead = side * dz > PARALLEL
         t = torch.where(ahead, -oz / torch.where(ahead, dz, torch.ones_like(dz)), torch.zeros_like(like))
-        found = ahead & (t >= 0)
-        return SurfaceIntersection(torch.where(found, t, torch.zeros_like(t)), 0.0, 0.0, found)
+        valid = ahead & (t >= 0)
+        return SurfaceIntersection(torch.where(valid, t, torch.zeros_like(t)), 0.0, 0.0, valid)

@@ -25,14 +25,11 @@ EQUATOR = 1.0 - 1e-9
 
 @dataclass(frozen=True)
 class Sphere(Surface[None]):
-    """A spherical surface of signed radius R, mm, not 0; infinite for a plane.
+    """A spherical surface of signed radius R, mm, not 0; infinite for a plane."""
 
-    Args:
-        radius: R.
-        reach: semi-aperture for which its bounds hold, mm.
-    """
-
+    #: R.
     radius: float
+    #: Semi-aperture for which its bounds hold, mm.
     reach: float = math.inf
 
     def __post_init__(self):
@@ -81,9 +78,9 @@ class Sphere(Surface[None]):
         t = big_f / (big_g + side * root)
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
         cosine = 1.0 - k * z  # towards the vertex's half; 0 at the equator
-        found = met & (t >= 0) & (cosine > math.sqrt(1.0 - EQUATOR**2)) & (side * (dz * cosine - k * (x * dx + y * dy)) > 0)
+        valid = met & (t >= 0) & (cosine > math.sqrt(1.0 - EQUATOR**2)) & (side * (dz * cosine - k * (x * dx + y * dy)) > 0)
         none, one = torch.zeros_like(t), torch.ones_like(t)
-        cosine = torch.where(found, cosine, one)
+        cosine = torch.where(valid, cosine, one)
         return SurfaceIntersection(
-            torch.where(found, t, none), torch.where(found, k * x / cosine, none), torch.where(found, k * y / cosine, none), found
+            torch.where(valid, t, none), torch.where(valid, k * x / cosine, none), torch.where(valid, k * y / cosine, none), valid
         )

@@ -107,7 +107,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
         given = wavelengths or white(WHITE_LINES)
         parts, channels = (1.0 / len(given),) * len(given), (None,) * len(given)
     else:
-        given, parts, channels = own, scene.light.parts, scene.light.channels
+        given, parts, channels = own, scene.light.fractions, scene.light.channels
     states = (0.0, 90.0) if scene.light.tracked and scene.light.polarisation is None else (scene.light.polarisation,)
     for wavelength, part, channel in zip(given, parts, channels, strict=True):
         lens = replace(scene.lens, roughness=0.0)
@@ -124,10 +124,10 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
 def lines_of_system(system: System) -> list[Line]:
     """Spectral lines of a system, source by source."""
     given = system.light.wavelengths or white(WHITE_LINES)
-    parts = system.light.parts if system.light.wavelengths else (1.0 / len(given),) * len(given)
+    parts = system.light.fractions if system.light.wavelengths else (1.0 / len(given),) * len(given)
     return [
         Line(wavelength, fraction * part, system.with_source(source), wavelength)
-        for source, fraction in zip(system.sources, system.parts, strict=True)
+        for source, fraction in zip(system.sources, system.fractions, strict=True)
         for wavelength, part in zip(given, parts, strict=True)
     ]
 

@@ -100,7 +100,7 @@ class Optics:
 
     def interactions(self, u: Tensor, v: Tensor) -> Interaction:
         """Rays through points (N,) of the pupil at the last element, behind the interaction."""
-        rays = self.mode.through(u, v, self.system.before.index_at(self.label))
+        rays = self.mode.through(u, v, self.system.object_space.index_at(self.label))
         return Tracer(self.system, rays, requests=STAGES, wavelength=self.label).last(self.parameters)
 
     def intercepts(self, u: Tensor, v: Tensor) -> Intercepts:

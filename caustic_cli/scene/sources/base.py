@@ -75,7 +75,7 @@ class Source:
         """Whether it is a single source of uniform radiance over the ellipse of its extent."""
         return len(self.members) == 1 and self.brightness is None and self.rays is None
 
-    def part(self, k: int, of: int) -> Source:
+    def batch(self, k: int, of: int) -> Source:
         """The k-th of `of` equivalent sources without common rays: itself, unless its rays are those of a file."""
         return self
 

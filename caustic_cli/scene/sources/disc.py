@@ -64,8 +64,8 @@ class Disc(Source):
         if self.brightness is not None:
             light = np.asarray(self.brightness, dtype=float)
             with np.errstate(over="ignore"):
-                whole = light.sum()
-            if light.ndim != 2 or not np.isfinite(light).all() or (light < 0).any() or not 0 < whole < np.inf:
+                total = light.sum()
+            if light.ndim != 2 or not np.isfinite(light).all() or (light < 0).any() or not 0 < total < np.inf:
                 raise InputError("⟨source.file⟩ of a disc must be a 2-D picture, finite, not negative, and not black all over")
             object.__setattr__(self, "brightness", light)
             if self.distant and self.frame[0] * self._reach[2] >= 1.0:

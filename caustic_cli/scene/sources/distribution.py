@@ -32,15 +32,13 @@ STEPS = 60
 class Distribution:
     """A tabulated intensity distribution.
 
-    Args:
-        angles: ascending from 0 to at most 180, degrees; values beyond 90 are ignored.
-        values: relative intensity at each angle, not negative.
-
     Raises:
         InputError: a condition is violated, or there is no light within 90 degrees.
     """
 
+    #: Ascending from 0 to at most 180, degrees; values beyond 90 are ignored.
     angles: tuple[float, ...]
+    #: Relative intensity at each angle, not negative.
     values: tuple[float, ...]
 
     def __post_init__(self):

@@ -14,15 +14,12 @@ from caustic_cli.scene.sources.section import SourceType, Table
 
 @dataclass(frozen=True, eq=False)
 class PlaneWave(Source):
-    """A collimated beam at normal incidence on the entrance, as wide as the lens' aperture.
+    """A collimated beam at normal incidence on the entrance, as wide as the lens' aperture."""
 
-    Args:
-        power: power through the aperture, W.
-        profile: optional relative irradiance E over the aperture, (a, b) non-negative, [i, j] with i along +x and j
-            along +y, constant on each cell (eq. 4.2.3); None for uniform irradiance.
-    """
-
+    #: Power through the aperture, W.
     power: float = 1.0
+    #: Optional relative irradiance E over the aperture, (a, b) non-negative, [i, j] with i along +x and j along +y, constant on
+    #: each cell (eq. 4.2.3); None for uniform irradiance.
     profile: np.ndarray | None = None
 
     kind = "plane"
@@ -33,8 +30,8 @@ class PlaneWave(Source):
         if self.profile is not None:
             e = np.asarray(self.profile, dtype=float)
             with np.errstate(over="ignore"):
-                whole = e.sum()
-            if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not 0 < whole < np.inf:
+                total = e.sum()
+            if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not 0 < total < np.inf:
                 raise InputError("⟨source.profile⟩ must be a 2-D picture, finite, not negative, and not black all over")
             object.__setattr__(self, "profile", e)
 

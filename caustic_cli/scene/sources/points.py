@@ -28,24 +28,21 @@ MAX_POINTS = 1_000_000
 
 @dataclass(frozen=True)
 class Points(Source):
-    """Point sources, each with a position and a power, that emit into a cone about an axis.
+    """Point sources, each with a position and a power, that emit into a cone about an axis."""
 
-    Args:
-        positions: (x, y, z) of each, mm.
-        powers: emitted into the cone by each, W; None for 1 W in equal parts.
-        cone: half-angle of the cone, degrees; None for the narrowest that covers the lens from every position.
-        intensity: uniform, lambertian, or tabulated.
-        aimed: rays are sampled over the lens (importance sampling); otherwise over the whole cone.
-        kind: point, or grid for points that represent an extended source.
-        axis: of the cones and intensities, a unit vector.
-    """
-
+    #: (x, y, z) of each, mm.
     positions: tuple[tuple[float, float, float], ...]
+    #: Emitted into the cone by each, W; None for 1 W in equal parts.
     powers: tuple[float, ...] = None  # type: ignore[assignment]  # what None means is found on construction
+    #: Half-angle of the cone, degrees; None for the narrowest that covers the lens from every position.
     cone: float | None = None
+    #: uniform, lambertian, or tabulated.
     intensity: str | Distribution = "uniform"
+    #: Rays are sampled over the lens (importance sampling); otherwise over the whole cone.
     aimed: bool = True
+    #: point, or grid for points that represent an extended source.
     kind: str = "point"
+    #: Of the cones and intensities, a unit vector.
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def __post_init__(self):

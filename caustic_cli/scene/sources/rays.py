@@ -22,15 +22,13 @@ class Measured(Source):
     """A ray set in front of the lens.  Rays that do not reach the lens count as missing it.
 
     Its position is the rays' point of closest approach, and its extent is their width there (`RaySet`).
-
-    Args:
-        rays: in the file's own coordinates, whose z axis is parallel to the scene's.
-        position: of the origin of these coordinates, mm.
-        power: of all rays, W.
     """
 
+    #: In the file's own coordinates, whose z axis is parallel to the scene's.
     rays: RaySet = field()
+    #: Of the origin of these coordinates, mm.
     position: tuple[float, float, float] = (0.0, 0.0, -50.0)
+    #: Of all rays, W.
     power: float = 1.0
 
     kind = "rays"
@@ -43,9 +41,9 @@ class Measured(Source):
         """The point of closest approach."""
         return (self.rays.focus + self.position)[None, :], np.ones(1)
 
-    def part(self, k: int, of: int) -> Source:
+    def batch(self, k: int, of: int) -> Source:
         """As of a source: a random partition of the rays."""
-        return replace(self, rays=self.rays.part(k, of))
+        return replace(self, rays=self.rays.batch(k, of))
 
     @property
     def extent(self) -> tuple[float, float]:

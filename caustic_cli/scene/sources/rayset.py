@@ -21,7 +21,7 @@ from caustic_cli.errors import InputError
 FARTHEST = 1e9
 #: Largest distance of the point of closest approach from the rays' starting points, mm: parallel rays have none.
 PARALLEL_AT = 1e6
-#: Least number of rays in a part: with fewer, a part may have none that reaches the lens.
+#: Least number of rays in a batch: with fewer, a batch may have none that reaches the lens.
 LEAST_SHARED = 50
 #: Range of valid wavelengths, nm.
 SHORTEST, LONGEST = 100.0, 20_000.0
@@ -31,23 +31,21 @@ SHORTEST, LONGEST = 100.0, 20_000.0
 class RaySet:
     """Rays of a source.
 
-    Args:
-        positions: (N, 3) mm, starting point of each ray.
-        directions: (N, 3), of any length but 0; stored as unit vectors.
-        flux: (N,) of each ray, not negative; relative, since the scene gives the power of its source.
-        total: flux of the whole source, in `unit`.
-        unit: W, or lm.
-        wavelengths: (N,) nm, or None.
-
     Raises:
         InputError: there are no rays, a number is not finite, a direction is zero, or a flux is negative or the total is 0.
     """
 
+    #: (N, 3) mm, starting point of each ray.
     positions: np.ndarray
+    #: (N, 3), of any length but 0; stored as unit vectors.
     directions: np.ndarray
+    #: (N,) of each ray, not negative; relative, since the scene gives the power of its source.
     flux: np.ndarray
+    #: Flux of the whole source, in `unit`.
     total: float = 1.0
+    #: W, or lm.
     unit: str = "W"
+    #: (N,) nm, or None.
     wavelengths: np.ndarray | None = None
 
     def __post_init__(self):
@@ -94,8 +92,8 @@ class RaySet:
             found.update(b"" if values is None else np.ascontiguousarray(values, "<f8").tobytes())
         return found.hexdigest()
 
-    def part(self, k: int, of: int) -> RaySet:
-        """The k-th part of a fixed random partition of the rays into `of` sets; all rays where there are too few."""
+    def batch(self, k: int, of: int) -> RaySet:
+        """The k-th batch of a fixed random partition of the rays into `of` sets; all rays where there are too few."""
         if self.count < LEAST_SHARED * of:
             return self
         mine = np.sort(np.random.default_rng(0).permutation(self.count)[k::of])

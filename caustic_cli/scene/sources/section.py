@@ -68,20 +68,21 @@ def no_idle_keys(_table: Table) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class SourceType:
-    """Descriptor of a source type.
+    """Descriptor of a source type."""
 
-    name: value of [source] type; note: the name with a remark for a comment; keys: keys of the section that it uses besides COMMON;
-    from_settings: constructs the source from the complete section and the profile's irradiance, if any; defaults: of its keys, from
-    the [lens] section; idle: keys that the other keys of a section make meaningless, and why; own: keys that no other type has,
-    each with its kind and help as of `table.Setting`.
-    """
-
+    #: Value of [source] type.
     name: str
+    #: The name with a remark for a comment.
     note: str
+    #: Keys of the section that it uses besides COMMON.
     keys: tuple[str, ...]
+    #: Constructs the source from the complete section and the profile's irradiance, if any.
     from_settings: Callable[[Table, np.ndarray | None], Source]
+    #: Of its keys, from the [lens] section.
     defaults: Callable[[Table], dict[str, Any]] = no_defaults
+    #: Keys that the other keys of a section make meaningless, and why.
     idle: Callable[[Table], dict[str, str]] = no_idle_keys
+    #: Keys that no other type has, each with its kind and help as of `table.Setting`.
     own: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
 

@@ -21,15 +21,13 @@ MOST = 64
 class Several(Source):
     """Mutually incoherent sources; each is traced separately, see `Scene.bands`.
 
-    Args:
-        members: two or more sources, none of them a `Several`.
-        spectra: wavelengths, nm, and relative powers of each; empty if not given.
-
     Raises:
         InputError: there are too few or too many, or only some of them have wavelengths.
     """
 
+    #: Two or more sources, none of them a `Several`.
     members: tuple[Source, ...] = ()
+    #: Wavelengths, nm, and relative powers of each; empty if not given.
     spectra: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
 
     kind = "several"
@@ -43,69 +41,69 @@ class Several(Source):
     @property
     def power(self) -> float:
         """Total power, W."""
-        return math.fsum(one.power for one in self.members)
+        return math.fsum(member.power for member in self.members)
 
     @property
     def fractions(self) -> tuple[float, ...]:
         """Fraction of the total power of each."""
-        return tuple(one.power / self.power for one in self.members)
+        return tuple(member.power / self.power for member in self.members)
 
     @property
     def collimated(self) -> bool:
         """Whether all of them are, with uniform profiles."""
-        return all(one.collimated and one.profile is None for one in self.members)
+        return all(member.collimated and member.profile is None for member in self.members)
 
     @property
     def distant(self) -> bool:
         """Whether all of them are."""
-        return all(one.distant for one in self.members)
+        return all(member.distant for member in self.members)
 
     @property
     def half_angle(self) -> float:
         """The largest."""
-        return max(one.half_angle for one in self.members)
+        return max(member.half_angle for member in self.members)
 
-    def part(self, k: int, of: int) -> Source:
+    def batch(self, k: int, of: int) -> Source:
         """As of a source, of each."""
-        return replace(self, members=tuple(one.part(k, of) for one in self.members))
+        return replace(self, members=tuple(member.batch(k, of) for member in self.members))
 
     @property
     def _near(self) -> list[Source]:
-        return [one for one in self.members if not one.distant]
+        return [member for member in self.members if not member.distant]
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions of all near members, weighted by power."""
         if self.distant:
             return super().points()
-        places, parts = zip(*(one.points() for one in self._near), strict=True)
-        parts = np.concatenate([one.power * p for one, p in zip(self._near, parts, strict=True)])
+        places, parts = zip(*(member.points() for member in self._near), strict=True)
+        parts = np.concatenate([member.power * p for member, p in zip(self._near, parts, strict=True)])
         return np.concatenate(places), parts / parts.sum()
 
     @property
     def extent(self) -> tuple[float, float]:
         """The largest along each axis."""
-        x, y = (max((one.extent[k] for one in self._near), default=0.0) for k in (0, 1))
+        x, y = (max((member.extent[k] for member in self._near), default=0.0) for k in (0, 1))
         return x, y
 
     @property
     def nearest(self) -> float:
         """Of all."""
-        return max(one.nearest for one in self.members)
+        return max(member.nearest for member in self.members)
 
     @property
     def extended(self) -> bool:
         """Whether some point of the lens receives light from more than one direction."""
-        return self.apart or any(one.extended for one in self.members)
+        return self.apart or any(member.extended for member in self.members)
 
     @property
     def apart(self) -> bool:
         """Whether their centres differ, or a member is `apart` itself."""
-        return len({one.centre for one in self.members}) > 1 or any(one.apart for one in self.members)
+        return len({member.centre for member in self.members}) > 1 or any(member.apart for member in self.members)
 
     @property
     def sharp(self) -> bool:
         """Whether all are, at a common position."""
-        return not self.apart and all(one.sharp for one in self.members)
+        return not self.apart and all(member.sharp for member in self.members)
 
     @property
     def label(self) -> str:
@@ -118,21 +116,21 @@ class Several(Source):
 
     def pointlike(self) -> Source:
         """Each without its extent."""
-        return Several(tuple(one.pointlike() for one in self.members), self.spectra)
+        return Several(tuple(member.pointlike() for member in self.members), self.spectra)
 
     def apparent_angle(self, z_in: float) -> float:
         """The largest."""
-        return max(one.apparent_angle(z_in) for one in self.members)
+        return max(member.apparent_angle(z_in) for member in self.members)
 
     def blur(self, z_in: float, throw: float) -> float:
         """The largest; sources at different positions form a picture each."""
-        return max(one.blur(z_in, throw) for one in self.members)
+        return max(member.blur(z_in, throw) for member in self.members)
 
     def cone_over(self, pupil: Pupil) -> float:
         """The widest; a hemisphere where some are distant and others not."""
         if self._near and len(self._near) < len(self.members):
             return math.pi / 2.0
-        return max(one.cone_over(pupil) for one in self.members)
+        return max(member.cone_over(pupil) for member in self.members)
 
     def power_words(self, pupil: Pupil) -> str:
         """The sum of all."""
@@ -140,12 +138,12 @@ class Several(Source):
 
     def emitted(self, pupil: Pupil) -> tuple[float, str]:
         """Of all together."""
-        whole = math.fsum(one.power / one.emitted(pupil)[0] for one in self.members)
-        return self.power / whole, "by all sources, each in all its directions"
+        emitted = math.fsum(member.power / member.emitted(pupil)[0] for member in self.members)
+        return self.power / emitted, "by all sources, each in all its directions"
 
     def incidence(self, pupil: Pupil) -> float:
         """The greatest."""
-        return max(one.incidence(pupil) for one in self.members)
+        return max(member.incidence(pupil) for member in self.members)
 
 
 def lights_of(section: Table, color: bool = False) -> list[Light]:
@@ -164,5 +162,5 @@ def light_of_all(section: Table, color: bool = False) -> Light:
         return lights[0]
     powers = [table["power"] for table in (section, *section["also"])]
     wavelengths = tuple(w for light in lights for w in light.wavelengths)
-    weights = tuple(power * part for power, light in zip(powers, lights, strict=True) for part in light.parts)
+    weights = tuple(power * part for power, light in zip(powers, lights, strict=True) for part in light.fractions)
     return replace(lights[0], wavelengths=wavelengths, weights=weights)

@@ -24,7 +24,7 @@ class SecondPicture(Output):
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """Write the image on the second screen, if there is one: second_image, and the figures of `second_figures`."""
         lens, place = rendering.lens, rendering.place
-        if lens.scene.second is None:
+        if lens.scene.second_target is None:
             return {}
         target = lens.origin.second_target(lens.scene)
         with rendering.say.notify_if_slow("tracing the light behind the picture"):
