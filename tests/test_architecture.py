@@ -2,10 +2,7 @@
 
 import ast
 import math
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -263,19 +260,6 @@ def test_scene_and_bare_errors_need_no_torch():
     assert not [m for m in modules if any(i.split(".")[0] in {"torch", "scipy"} for i in IMPORTS[m])]
 
 
-def test_a_trace_in_plain_torch_loads_no_kernel_and_no_capability():
-    """What a scene does not ask for is loaded neither with the tracer nor with its reference backend."""
-    code = """
-import sys
-import caustic_cli.optics.trace, caustic_cli.optics.backends.reference
-rooms = ("kernels", "gradient", "waves", "mesh", "misalignment", "obstruction", "reintersection", "bounds", "plan", "spread")
-found = [m for m in sys.modules if m.startswith(tuple("caustic_cli.optics." + room for room in rooms)) or m == "numba"]
-effects = [m for m in sys.modules if m.startswith("caustic_cli.optics.effects.")]
-sys.exit(0 if not found and effects == ["caustic_cli.optics.effects.base"] else f"{found} {effects}")
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"CAUSTIC_KERNELS": "torch"})
-
-
 def test_no_two_modules_import_each_other():
     """A depth-first search over all imports, those inside functions included; packages' own __init__ files are only fronts."""
     graph = {m: {i for i in imported if i in IMPORTS and i != m and not m.startswith(i + ".")} for m, imported in IMPORTS.items()}
@@ -293,22 +277,6 @@ def test_no_two_modules_import_each_other():
         visit(module, ())
     assert not cycles
     assert sum(map(len, graph.values())) > 40
-
-
-#: The stage loop and what it needs of the inverse problem: no kind of design, no wave image, no extended source.
-CORE = {"constraints", "designer", "lbfgs", "loss_terms", "losses", "objective", "optimisers", "parametrisation", "penalties"}
-CORE |= {"problem", "ranks", "schedule"}
-
-
-def test_the_stage_loop_knows_no_kind_of_design():
-    """All that its modules import, directly or not."""
-    found, ahead = {"caustic_cli.inverse.designer"}, ["caustic_cli.inverse.designer"]
-    while ahead:
-        more = {m for m in IMPORTS[ahead.pop()] if m in IMPORTS and m.startswith("caustic_cli.inverse.")} - found
-        found |= more
-        ahead += more
-    assert {m.rpartition(".")[2] for m in found} == CORE
-    assert not {"kinds", "config", "studies", "io"} & {part for m in found for part in own(IMPORTS[m])}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))

@@ -10,7 +10,6 @@ from importlib import import_module
 from typing import cast
 
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import default
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.surface import Described, OneSurface
 
@@ -19,10 +18,10 @@ from caustic_cli.kinds.surface import Described, OneSurface
 KINDS = (
     ("lens.gradient", "gradient_index.IndexPlate"),
     ("second", "two_sided.TwoSides"),
-    ("elements", "elements.FreeElements"),
+    ("element", "elements.FreeElements"),
     ("design.over", "network_range.NetworkAmongElements"),
     ("design.over", "network_range.NetworkOverRange"),
-    ("elements", "elements.AmongElements"),
+    ("element", "elements.AmongElements"),
     ("design.robust", "robust.RobustArray"),
     ("lens.array", "lenslet_array.LensletArray"),
     ("design.robust", "robust.RobustSurface"),
@@ -32,20 +31,12 @@ KINDS = (
 def kind_of(s: Settings) -> type[OneSurface]:
     """The kind of the design of these settings."""
     for setting, name in KINDS:
-        if _is_given(s, setting):
+        if s.chosen(setting):
             module, _, title = name.partition(".")
             kind = cast(type[OneSurface], getattr(import_module(f"{__name__}.{module}"), title))
             if kind.applies(s):
                 return kind
     return OneSurface
-
-
-def _is_given(s: Settings, path: str) -> bool:
-    """Whether a setting differs from its default, or a section is there."""
-    if "." not in path:
-        return bool(getattr(s, path))
-    value, usual = s.value(path), default(path)
-    return bool(value) and value != usual
 
 
 def problem_of(described: Described, device: str = "cpu") -> OneSurface:
