@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli, load
-from caustic_cli.config import default_stages
 from caustic_cli.errors import InputError
 from caustic_cli.export.bodies import CLOSE, bodies
 from caustic_cli.export.lighttools import write_lighttools
@@ -312,7 +310,7 @@ def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
 @pytest.fixture
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 200_000, report=True)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True final_rays=200000")
     light = picture()
     Image.fromarray((255 * light / light.max()).astype(np.uint8).T[::-1]).save("one.png")
 
@@ -392,7 +390,7 @@ def test_what_other_elements_exclude_is_named_as_it_was_given(_here, capfd, opti
 
 
 def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):
-    monkeypatch.setattr(default_stages, "LEAST_CELLS", 256)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test final_rays=200000 source_cells=256")
     beside = ("--element", "lens z=60 thickness=6 radius=150,-150 index=1.5 size=26 free=both")
     fixed = ("--element", beside[1].removesuffix(" free=both"))
     one = run(capfd, "design", "one.png", *SMALL, *fixed, "--iterations", "8", "-o", "one")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from rayfiles import cone_of, zemax
 from test_emission import LENS, heights
 
@@ -147,7 +147,6 @@ def test_settings_go_round():
 def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    small_designs(monkeypatch, 40_000)
     Path("led.dat").write_bytes(zemax(*cone_of(20_000, 12.0)))
     Path("led.csv").write_text("0,1\n30,0.5\n")
     Path("two.toml").write_text(

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config.table import check_all
+from caustic_cli.effort import STANDARD, Effort
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.loss_terms import parse
@@ -72,13 +73,22 @@ class Problem:
         target: (n_x, n_y) irradiance on the scene's screen, not all zero.
         stages, options: of the optimisation.
         device: where rays are traced.
+        effort: of the initial surface and of the evaluation.
 
     Raises:
         InputError: stages and options contradict each other, or the lens leaves no room before the screen.
     """
 
-    def __init__(self, scene: Scene, target: Tensor, stages: list[Stage], options: Options, device: str = "cpu"):
-        self.scene, self.target, self.device = scene, target, device
+    def __init__(
+        self,
+        scene: Scene,
+        target: Tensor,
+        stages: list[Stage],
+        options: Options,
+        device: str = "cpu",
+        effort: Effort = STANDARD,
+    ):
+        self.scene, self.target, self.device, self.effort = scene, target, device, effort
         self.stages, self.options = stages, options
         self._prepare()
 
