@@ -25,11 +25,12 @@ OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, 
 BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
 
 
-#: Settings that exclude a second target, other elements, and free-form surfaces of those: with any value but the default, or with
-#: one.
+#: Settings that exclude a second target, other elements, those of them that do more than fold the axis, and free-form surfaces of
+#: theirs: with any value but the default, or with one.
 EXCLUDED_BY = {
     "second": ("lens.mirror", "target.color", "lens.gradient", "lens.array", "design.robust", "design.network", "design.optimizer"),
-    "element": ("design.robust", "design.waves on", "lens.gradient"),
+    "element": ("lens.gradient",),
+    "beside": ("design.robust", "design.waves on"),
     "element.free": ("design.network", "design.optimizer", "target.color"),
 }
 

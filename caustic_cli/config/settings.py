@@ -391,6 +391,11 @@ def build_scene(settings: Settings) -> Scene:
     )
 
 
+def accompanied(s: Settings) -> bool:
+    """Whether a scene has other elements that do more than fold the axis; from complete settings."""
+    return bool(s.elements and build_scene(s).unfolded.elements)
+
+
 def _component(element: ElementSettings, wavelength: float) -> Component:
     """The lens or mirror of an [[element]] table, whose size must be given."""
     kind = check("element.type", element.get("type", "lens"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from caustic_cli.config.default_stages import LEAST_WAVES, Table, on_waves, wave_refinement
-from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen, build_source
+from caustic_cli.config.settings import Settings, accompanied, build_lens, build_light, build_screen, build_source
 from caustic_cli.errors import InputError
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Scene, Source
@@ -29,7 +29,7 @@ def _not_by_default(s: Settings) -> str:
     """The feature for which `waves = "auto"` never refines the wave image, and how to include it; "" if there is none."""
     if "gradient" in s.lens:
         return "wave images are implemented for homogeneous lenses only"
-    if s.elements:
+    if accompanied(s):
         return "wave images are implemented for a single lens only"
     if s.source.type == "rays":
         return "a ray file contains no phase"

@@ -67,6 +67,7 @@ def performance_limits(scene: Scene, target: np.ndarray, steps: int | None = Non
     target: (n, m) irradiance, or (3, n, m) in colour, whose bound is the mean of its colours', as their error is; steps: as of
     `deconvolved`.
     """
+    scene = scene.unfolded
     if not scene.source.extended or scene.source.apart or scene.elements:
         return SourceLimits(None, None)
     images = source_images(scene)

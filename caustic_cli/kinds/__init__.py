@@ -12,7 +12,7 @@ from caustic_cli.kinds.elements import AmongElements, FreeElements
 from caustic_cli.kinds.gradient_index import IndexPlate
 from caustic_cli.kinds.lenslet_array import LensletArray
 from caustic_cli.kinds.network_range import NetworkAmongElements, NetworkOverRange
-from caustic_cli.kinds.robust import RobustArray, RobustSurface
+from caustic_cli.kinds.robust import RobustAmongElements, RobustArray, RobustSurface
 from caustic_cli.kinds.surface import Described, OneSurface
 from caustic_cli.kinds.two_sides import TwoSides
 
@@ -23,6 +23,7 @@ KINDS: tuple[type[OneSurface], ...] = (
     FreeElements,
     NetworkAmongElements,
     NetworkOverRange,
+    RobustAmongElements,
     AmongElements,
     RobustArray,
     LensletArray,

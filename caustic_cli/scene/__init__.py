@@ -40,6 +40,7 @@ __all__ = [
 ]
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property, reduce
 
 from caustic_cli.errors import InputError
 from caustic_cli.scene.materials import refractive_index
@@ -101,8 +102,10 @@ class Scene:
         lens = self.lens
         second = "second.file" if self.second is None else self.second.setting
         wrong = {"lens.mirror": lens.mirror, "lens.gradient": lens.gradient is not None, "lens.array": lens.arrayed}
-        check_compatible_with_elements(wrong | {second: self.two_sided, "source.type": self.source.rays is not None and "rays"})
+        check_compatible_with_elements(wrong | {second: self.two_sided})
         check_positions(self.elements, (lens.z_in, lens.offset.thickness), self.source.nearest, self.screen.z)
+        if self.source.rays is not None and self.unfolded.elements:
+            check_compatible_with_elements({"source.type": "rays"})
 
     @property
     def before(self) -> tuple[Component, ...]:
@@ -113,6 +116,15 @@ class Scene:
     def behind(self) -> tuple[Component, ...]:
         """The elements behind the lens."""
         return self.elements[len(self.before) :]
+
+    @cached_property
+    def unfolded(self) -> Scene:
+        """The equivalent scene with a straight axis and without other elements, its screen as seen in the mirrors, if the other
+        elements only fold the axis; itself otherwise."""
+        mirrors = [e for e in self.elements if isinstance(e, FoldMirror) and e.flat]
+        if len(mirrors) < len(self.elements):
+            return self
+        return replace(self, elements=(), screen=reduce(lambda screen, mirror: mirror.shows(screen), mirrors, self.screen))
 
     @property
     def free_surfaces(self) -> tuple[str, ...]:

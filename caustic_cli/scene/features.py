@@ -18,7 +18,7 @@ FEATURES: dict[str, Callable[[Scene], bool]] = {
     MIRROR: lambda s: s.lens.mirror,
     GRADIENT: lambda s: s.lens.gradient is not None,
     FREE_ENTRANCE: lambda s: s.two_sided,
-    ELEMENTS: lambda s: bool(s.elements),
+    ELEMENTS: lambda s: bool(s.unfolded.elements),
     "absorption": lambda s: s.lens.absorption > 0 or any(e.absorption > 0 for e in s.elements),
     "roughness": lambda s: s.lens.roughness > 0,
     "polarised light": lambda s: s.light.polarisation is not None,

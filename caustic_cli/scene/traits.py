@@ -27,7 +27,7 @@ TRAITS: Mapping[str, Trait] = {
     "mirror": Trait("a mirror", lambda s: s.lens.mirror),
     "gradient index": Trait("an index that varies", lambda s: s.lens.gradient is not None),
     "two sides": Trait("a free-form entrance", lambda s: s.two_sided),
-    "other elements": Trait("other elements beside it", lambda s: bool(s.elements)),
+    "other elements": Trait("other elements beside it", lambda s: bool(s.unfolded.elements)),
     "lenslet array": Trait("lenslets", lambda s: s.lens.arrayed),
     "circular aperture": Trait("a circular aperture", lambda s: s.lens.opening.round),
     "absorption": Trait("absorption", lambda s: s.lens.absorption > 0 or any(e.absorption > 0 for e in s.elements)),

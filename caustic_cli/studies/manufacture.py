@@ -147,7 +147,7 @@ def _thinner(scene: Scene, low: float, high: float) -> str:
     sheet = SHEET * max(scene.lens.size)
     room = sheet - (low - scene.lens.z_in)  # not positive for a lens that is not a plate
     near = math.isfinite(scene.source.nearest)
-    if near or scene.lens.mirror or scene.elements or not 0.0 < room < high - low:
+    if near or scene.lens.mirror or scene.unfolded.elements or not 0.0 < room < high - low:
         return ""
     middle = scene.lens.offset.thickness
     throw = float(f"{middle + (scene.screen.z - middle) * (high - low) / room:.2g}")

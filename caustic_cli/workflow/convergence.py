@@ -6,7 +6,7 @@ What they are called and which options they take is known without torch: what a 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -89,7 +89,7 @@ class StudyKind:
 
     def unsupported(self, lens: Lens) -> str | None:
         """Why it does not support a lens, None if it does."""
-        if lens.scene.elements and not self.any_scene:
+        if lens.scene.unfolded.elements and not self.any_scene:
             return (
                 f"⟨study⟩ {self.name} supports single lenses only, and this scene has [[element]] tables; studies of such scenes"
                 f" are {', '.join(kind.name for kind in STUDIES.values() if kind.any_scene)}"
@@ -106,6 +106,8 @@ class StudyKind:
 
         if asked.lens and (why := self.unsupported(asked.lens)):
             raise InputError(why)
+        if asked.lens and not self.any_scene:
+            asked = replace(asked, lens=replace(asked.lens, scene=asked.lens.scene.unfolded))
         compile_usual(asked.device, asked.say)
         return self.run(asked)
 

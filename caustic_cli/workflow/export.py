@@ -183,7 +183,7 @@ def unsupported(scene: Scene, format: str, script: bool, mould: bool) -> str | N
             f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both,"
             " without ⟨script⟩ or ⟨mould⟩"
         )
-    if scene.elements and (script or format == "zemax"):
+    if (script and scene.elements) or (format == "zemax" and scene.unfolded.elements):
         return f"⟨format⟩ {format} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
     return None
 

@@ -19,6 +19,7 @@ import json
 import math
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
@@ -74,7 +75,7 @@ def unsupported(scene: Scene) -> str | None:
         return "⟨html⟩: the page traces light to plane screens, not to curved ones"
     if scene.lens.gradient is not None:
         return "⟨html⟩: the page traces lenses of one index, and this one's varies"
-    if scene.elements:
+    if scene.unfolded.elements:
         return "⟨html⟩: the page traces a single lens, and this scene has [[element]] tables"
     if scene.two_sided:
         return "⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form"
@@ -114,6 +115,7 @@ def write_page(
     """
     if why := unsupported(scene):
         raise InputError(why)
+    scene = scene.unfolded
     screen, kind = _coarser(scene.screen), scene.lens.kind
     data = {
         "title": title,
@@ -202,7 +204,7 @@ def _coarser(screen: Screen) -> Screen:
     """The screen with at most PIXELS pixels across."""
     factor = max(1.0, max(screen.resolution) / PIXELS)
     nx, ny = (max(1, round(n / factor)) for n in screen.resolution)
-    return Screen(screen.size, screen.z, (nx, ny), screen.tilt, screen.shift)
+    return replace(screen, resolution=(nx, ny))
 
 
 def _onto(image: np.ndarray, screen: Screen) -> np.ndarray:

@@ -242,5 +242,5 @@ def not_single(option: str, lens: Lens) -> str | None:
     """Why an output of single lenses of uniform index with a flat entrance does not support a lens."""
     scene = lens.scene
     beyond = "a free-form entrance" if scene.two_sided else "an index that varies" if scene.lens.gradient is not None else ""
-    beyond = "other elements beside it" if scene.elements else beyond
+    beyond = "other elements beside it" if scene.unfolded.elements else beyond
     return f"⟨{option}⟩ supports lenses of uniform index with a flat entrance, and this one has {beyond}" if beyond else None
