@@ -159,6 +159,8 @@ def refuse(scene: Scene) -> None:
         raise InputError(
             f"⟨script⟩ builds clear lenses and straight screens, not {', '.join(beyond)}, which the archive alone holds"
         )
+    if len(source.members) > 1:
+        raise InputError("⟨script⟩ builds one source, so that several, which the archive alone holds, cannot be written")
     if scene.light.unit != "W":
         raise InputError(f"⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written")
     if source.profile is not None:
