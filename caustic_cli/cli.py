@@ -57,13 +57,11 @@ def _run(arguments: list[str]) -> int:
         if status == 130:  # some versions of Typer convert a KeyboardInterrupt to this
             raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
-    except BrokenPipeError:  # the reader of stdout has closed the pipe
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except SystemExit as stop:  # Typer's reaction to a closed pipe
-        if isinstance(stop.__context__, OSError) and stop.__context__.errno == errno.EPIPE:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
+    except BrokenPipeError:
+        return _closed_pipe()
+    except SystemExit as stop:
+        if isinstance(stop.__context__, OSError) and stop.__context__.errno == errno.EPIPE:  # Typer's reaction to a closed pipe
+            return _closed_pipe()
         return stop.code if isinstance(stop.code, int) else 1
     except typer.Exit as stop:
         return stop.exit_code
@@ -78,6 +76,12 @@ def _run(arguments: list[str]) -> int:
         if debug:
             raise
         return _report(problem)
+
+
+def _closed_pipe() -> int:
+    """Exit status after the reader of stdout has closed the pipe."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
 
 
 def _report(problem: Exception) -> int:

@@ -10,7 +10,7 @@ from PIL import Image
 from caustic_cli.config import default_stages
 from caustic_cli.inverse import deconvolution, initial_surface
 from caustic_cli.kinds import OneSurface, lenslet_array
-from caustic_cli.workflow import evaluation
+from caustic_cli.studies import design_report
 
 
 def write_blob(name: str = "blob.png", size: int = 24, centre: tuple[float, float] = (8, 9), width: float = 30.0) -> None:
@@ -41,7 +41,7 @@ def small_designs(patch, rays: int, report: bool = False) -> None:
     patch.setattr(deconvolution, "MOST_STEPS", 400)
     patch.setattr(OneSurface, "final_rays", rays)
     if not report:
-        patch.setattr(evaluation, "write_report", lambda *args: None)
+        patch.setattr(design_report, "write_report", lambda *args: None)
 
 
 def pairwise(*lists: Sequence) -> list[tuple]:

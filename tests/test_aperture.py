@@ -17,9 +17,9 @@ from caustic_cli import cli
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.export.lattice import LATTICES
 from caustic_cli.export.lighttools import write_lighttools
-from caustic_cli.export.lighttools_script import refuse
 from caustic_cli.export.mesh import FLANGE, closed_mesh, rim_of
 from caustic_cli.export.mitsuba import companions, write_mitsuba
+from caustic_cli.export.supported import SCRIPT
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
@@ -206,7 +206,7 @@ def test_round_tolerance_wants_no_kinks():
 
 def test_scripts_are_for_rectangles():
     with pytest.raises(InputError, match="script"):
-        refuse(rounded(make())[0])
+        SCRIPT.refuse(rounded(make())[0])
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=NAMES)

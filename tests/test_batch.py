@@ -17,9 +17,9 @@ from caustic_cli.commands.console import Reporter, ended_words
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.kinds import OneSurface
 from caustic_cli.project import checkpoint
+from caustic_cli.studies import design_report
 from caustic_cli.studies.radius import cost_of_radius
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow import evaluation
 
 DESIGN = [
     "design",
@@ -46,7 +46,7 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     paint("blob.png", 5)
     small_designs(monkeypatch, 5000, report=True)
-    monkeypatch.setattr(evaluation, "write_report", lambda path, *rest: path.write_bytes(b"a report"))
+    monkeypatch.setattr(design_report, "write_report", lambda path, *rest: path.write_bytes(b"a report"))
 
 
 def paint(name, centre):

@@ -18,7 +18,7 @@ from caustic_cli.config.wave_stages import without_waves
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba
-from caustic_cli.export.page import unsupported
+from caustic_cli.export.page import PAGE
 from caustic_cli.export.zemax import write_zemax
 from caustic_cli.inverse.initial_surface import _Grid, first_surface
 from caustic_cli.inverse.projection import ScreenProjection
@@ -409,7 +409,7 @@ def test_formats_that_cannot_say_it(tmp_path):
     field, heights = HeightField.of(scene.lens), bumpy(scene)
     with pytest.raises(InputError, match="not a curved screen"):
         write_mitsuba(tmp_path / "lens.xml", scene, field, heights)
-    assert "plane screens" in unsupported(scene)
+    assert "plane screens" in PAGE.why_not(scene)
     with pytest.raises(NoWaveImage, match="curved screen has no wave image"):
         wave_image(scene, field, heights)
     write_zemax(tmp_path / "lens.dat", scene, field, heights)

@@ -212,8 +212,8 @@ def test_threads_are_what_was_asked_for():
 import torch
 from caustic_cli import cli
 from caustic_cli.kinds import OneSurface
-from caustic_cli.workflow import evaluation
-OneSurface.final_rays, evaluation.write_report = 1000, lambda *args: None
+from caustic_cli.studies import design_report
+OneSurface.final_rays, design_report.write_report = 1000, lambda *args: None
 for name in "ab":
     assert cli.run(["design", "blob.png", *{TINY!r}, "--iterations", "3", "-o", name]) == 0
     assert torch.get_num_threads() == 1, torch.get_num_threads()

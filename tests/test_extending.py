@@ -354,10 +354,9 @@ KIND = Addition(
     edits=(
         (
             "kinds/__init__.py",
-            "from caustic_cli.kinds.two_sides import TwoSides\n",
-            "from caustic_cli.kinds.two_sides import TwoSides\nfrom caustic_cli.kinds.two_throws import TwoThrows\n",
+            "KINDS = (\n",
+            'KINDS = (\n    ("design.farther", "two_throws.TwoThrows"),\n',
         ),
-        ("kinds/__init__.py", "    RobustSurface,\n", "    RobustSurface,\n    TwoThrows,\n"),
         (
             "config/table.py",
             "    over: str = setting(",

@@ -18,9 +18,9 @@ from caustic_cli.errors import InputError
 from caustic_cli.io.archive import open_archive
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
+from caustic_cli.studies import design_report
 from caustic_cli.studies.design_report import write_report
 from caustic_cli.studies.irradiance import irradiance_figures, per_part, unit_figures
-from caustic_cli.workflow import evaluation
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--waves", "off", "--quiet", "--threads", "1", "--json"]
 RENDER = ["render", "blob.caustic", "--rays", "20000", "--quiet", "--threads", "1", "--json"]
@@ -157,7 +157,7 @@ def test_the_table_and_the_report_say_it_too(capfd, monkeypatch):
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     bars, plain = [], Figure.colorbar
-    monkeypatch.setattr(evaluation, "write_report", write_report)
+    monkeypatch.setattr(design_report, "write_report", write_report)
 
     def colorbar(figure, drawn, **options):
         norm = drawn.norm

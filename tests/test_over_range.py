@@ -21,7 +21,7 @@ from caustic_cli.inverse.parametrisation import Architecture, parametrise
 from caustic_cli.inverse.range_training import BATCH, RangeAdam, RangeObjective
 from caustic_cli.inverse.scene_parameters import EVALUATED, Range, Ranges
 from caustic_cli.io.files import is_ours
-from caustic_cli.kinds import NetworkOverRange
+from caustic_cli.kinds.network_range import NetworkOverRange
 from caustic_cli.project import checkpoint
 from caustic_cli.studies import architectures
 from caustic_cli.studies.report import write

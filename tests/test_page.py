@@ -17,7 +17,7 @@ from helpers import small_designs, write_blob
 from rayfiles import cone_of, tm25
 
 from caustic_cli import cli, load
-from caustic_cli.export.page import MOST, _coded, _onto, unsupported, write_page
+from caustic_cli.export.page import MOST, PAGE, _coded, _onto, write_page
 from caustic_cli.io.files import is_ours
 from caustic_cli.scene import Screen
 from caustic_cli.studies.metrics import relative_rms
@@ -192,6 +192,6 @@ def test_rays_of_a_file_are_refused(home, monkeypatch, capfd):
     assert cli.run(["render", "point.caustic", *light, "--html", "rays.html", "-o", "rays.png"]) == 2
     assert "not the rays of a file" in capfd.readouterr().err and not Path("rays.html").exists() and not Path("rays.png").exists()
     scene = load(home / "point.caustic").scene
-    assert unsupported(scene) is None
-    rays = replace(scene, source=SimpleNamespace(members=(SimpleNamespace(rays=1),), nearest=-60.0))
-    assert "plane waves, points, grids and discs" in unsupported(rays)
+    assert PAGE.supports(scene)
+    rays = replace(scene, source=SimpleNamespace(rays=1, members=(1,), nearest=-60.0))
+    assert "plane waves, points, grids and discs" in PAGE.why_not(rays)

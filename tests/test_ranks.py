@@ -22,8 +22,8 @@ import sys
 from caustic_cli import cli
 from caustic_cli.workflow import design as workflow
 from caustic_cli.kinds import OneSurface
-from caustic_cli.workflow import evaluation
-OneSurface.final_rays, evaluation.write_report = 5000, lambda *args: None
+from caustic_cli.studies import design_report
+OneSurface.final_rays, design_report.write_report = 5000, lambda *args: None
 sys.exit(cli.run(["design", "blob.png", "--config", "c.toml", "--quiet", "--threads", "1", "-o", "two"]))
 """
 #: Both ways of emitting rays; 12 iterations of L-BFGS, whose line searches ask for more evaluations than that.

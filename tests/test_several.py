@@ -17,8 +17,8 @@ from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
-from caustic_cli.export import lighttools_script
 from caustic_cli.export.lighttools import write_lighttools
+from caustic_cli.export.supported import refuse
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
@@ -209,7 +209,7 @@ def test_an_archive_holds_all_of_them(tmp_path, spectra):
     with pytest.raises(InputError, match="source 4: its source is a ray file"):
         open_archive(tmp_path / "a.npz")
     with pytest.raises(InputError, match="builds one source"):
-        lighttools_script.refuse(Scene(Several(MEMBERS, (NONE,) * 5), LENS, SCREEN))
+        refuse(Scene(Several(MEMBERS[:2], (NONE,) * 2), LENS, SCREEN), "lighttools", script=True, mould=False)
     write_lighttools(tmp_path / "b.npz", replace(here, source=Several(MEMBERS[:2], spectra[:2])), field, z)
     with pytest.raises(InputError, match="none of this one's is"):
         open_archive(tmp_path / "b.npz", MEMBERS[3].rays)

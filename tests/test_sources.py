@@ -3,6 +3,7 @@
 import ast
 import math
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -288,8 +289,8 @@ class Ring(Source):
 @pytest.fixture
 def ring(monkeypatch):
     """A type of source that the package does not know, registered for one test."""
-    monkeypatch.setattr(sources, "_TYPES", dict(sources._TYPES))
-    monkeypatch.setattr(emission, "_MAKERS", dict(emission._MAKERS))
+    monkeypatch.setattr(sources, "_types", cache(partial(dict, sources._types())))
+    monkeypatch.setattr(emission, "_makers", cache(partial(dict, emission._makers())))
 
     def build(table, profile):
         return Ring(tuple(table["position"][0]), table["size"][0], table["power"])
@@ -349,6 +350,6 @@ def test_a_kind_that_others_do_not_know_is_refused_in_a_sentence(ring, monkeypat
     scene = Scene(Ring((0.0, 0.0, -20.0), 3.0), make()[0].lens, Screen((10.0, 10.0)))
     monkeypatch.setattr(verify, "find_spec", lambda name: True)
     assert "mitsuba does not support sources of type ring" in verify.unsupported(scene)
-    monkeypatch.delitem(emission._MAKERS, "ring")
+    monkeypatch.delitem(emission._makers(), "ring")
     with pytest.raises(InputError, match="type ring has no rays"):
         emission.rays_of(scene, "stratified", 10)

@@ -10,10 +10,12 @@ import torch
 from PIL import Image
 
 from caustic_cli.config.completion import complete
+from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import build_scene
 from caustic_cli.config.table import Parameters
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import is_ours
+from caustic_cli.kinds import OneSurface
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.intersection import find
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -49,9 +51,21 @@ def small():
     return scene, target, full
 
 
+def problem(scene, target, full) -> OneSurface:
+    """What a design of settings solves in a scene."""
+    return OneSurface(scene, torch.from_numpy(target), build_stages(full), build_options(full))
+
+
+def variants(scene, full) -> list:
+    """All design runs of settings in a scene."""
+    target = np.ones(scene.screen.resolution)
+    return comparison.variants(problem(scene, target, full), full)
+
+
 def run_of(small, k):
     scene, target, full = small
-    return comparison.TimedDesign(*comparison.variants(scene, full)[k], scene, torch.from_numpy(target))
+    name, *how = variants(scene, full)[k]
+    return comparison.TimedDesign(name, problem(scene, target, full).varied(*how))
 
 
 def test_both_errors_of_the_mesh_are_of_order_two(interaction):
@@ -225,7 +239,7 @@ def test_runs_get_equal_time_and_an_independent_evaluation():
 
 def test_the_runs_of_a_project(small):
     scene, target, full = small
-    plans = comparison.variants(scene, full)
+    plans = variants(scene, full)
     assert [series for series, *_ in plans] == [
         "lbfgs, 19x19",
         "lbfgs, 11x11",
@@ -235,7 +249,7 @@ def test_the_runs_of_a_project(small):
         "adam, sparse network, 19x19",
         "adam, dense network, 19x19",
     ]
-    assert [(o.optimizer, o.network) for *_, o in plans[3:]] == [
+    assert [(o.optimizer, o.parametrisation.network) for *_, o in plans[3:]] == [
         ("lbfgs", "none"),
         ("adam", "none"),
         ("adam", "sparse"),
@@ -252,11 +266,11 @@ def test_the_runs_of_a_project(small):
 def test_a_run_begins_by_transport_where_a_design_would():
     full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [35, 35]}}, 1.0, Parameters(rays=5000))
     scene = build_scene(full)
-    target = torch.from_numpy(comparison.disc(scene, full.target.size))
+    target = comparison.disc(scene, full.target.size)
     entries = {
-        plan[0]: comparison.TimedDesign(*plan, scene, target)
-        for plan in comparison.variants(scene, full)
-        if plan[0] in ("lbfgs, 35x35", comparison.TRANSPORT)
+        name: comparison.TimedDesign(name, problem(scene, target, full).varied(*how))
+        for name, *how in variants(scene, full)
+        if name in ("lbfgs, 35x35", comparison.TRANSPORT)
     }
     assert len(entries) == 2
     for entry in entries.values():
@@ -270,7 +284,7 @@ def test_a_lens_with_knots_of_its_own_keeps_its_net(small):
     scene, _, full = small
     knots = SplineSpace.uniform(19, 3).knots.tolist()
     own = replace(scene, lens=replace(scene.lens, knots=(knots, knots)))
-    plans = comparison.variants(own, full)
+    plans = variants(own, full)
     assert [series for series, *_ in plans][:2] == ["lbfgs, 19x19", "adam, 19x19"] and len(plans) == 4
     assert {s.control for _, stages, _ in plans for s in stages} == {(19, 19)}
 

@@ -18,10 +18,13 @@ from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
 from caustic_cli.config import completion
 from caustic_cli.config.default_stages import LEAST_WAVES, WAVES, wave_refinement
+from caustic_cli.config.design import build_options, build_stages
+from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.waves import WaveObjective
+from caustic_cli.kinds import OneSurface
 from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_magnification, white
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.waves.image import wave_image
@@ -228,8 +231,10 @@ def test_wavelengths_that_are_none(text, _here, capfd):
 
 def test_a_design_on_waves_alone_has_no_rays_to_compare_others_on():
     full = completion.complete({"lens": {"control": [9, 9]}, "design": {"stages": [{"waves": [550.0]}]}}, 1.0)
+    scene = build_scene(full)
+    target = torch.ones(scene.screen.resolution, dtype=torch.float64)
     with pytest.raises(InputError, match="one stage on rays is needed"):
-        comparison.variants(None, full)
+        comparison.variants(OneSurface(scene, target, build_stages(full), build_options(full)), full)
 
 
 def test_time_bounds_the_stages():

@@ -1,7 +1,7 @@
 """The manual pages: those of the commands, generated from the parser, and that of project.toml, from the table of settings.
 
 `python -m caustic_cli.commands.manpage man` writes caustic.1, a page for each command, and caustic-project.5, the reference of
-all settings.  The hand-written sections are below.
+all settings, and the matrix of capabilities in the guide.  The hand-written sections are below.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from caustic_cli.commands.parser import parser
 from caustic_cli.config import presets
 from caustic_cli.config.table import TABLE, Setting
 from caustic_cli.errors import plain_name
-from caustic_cli.io.files import write_bytes
+from caustic_cli.io.files import read_bytes, write_bytes
 from caustic_cli.scene import materials
+from caustic_cli.workflow.capabilities import matrix
 
 HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"
 .SH NAME
@@ -339,8 +340,21 @@ def _plain(text: str) -> str:
     return "\\&" + text if text[:1] in (".", "'") else text
 
 
+#: Chapter of the guide with the matrix of capabilities, beside the directory of the pages; what precedes and follows that there.
+GUIDE = "examples/guide/8-how-it-works.md"
+BEGIN, END = "<!-- capabilities: generated with the manual pages -->\n\n", "\n\n<!-- end of capabilities -->"
+
+
+def guide(chapter: str) -> str:
+    """The chapter with the matrix as it is today."""
+    head, rest = chapter.split(BEGIN)
+    return head + BEGIN + matrix() + END + rest.split(END)[1]
+
+
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         raise SystemExit("usage: python -m caustic_cli.commands.manpage DIRECTORY")
     for file, page in pages().items():
         write_bytes(Path(sys.argv[1]) / file, page.encode())
+    if (chapter := Path(sys.argv[1]).resolve().parent / GUIDE).exists():
+        write_bytes(chapter, guide(read_bytes(chapter, 1_000_000, "the guide is needed").decode()).encode())

@@ -411,12 +411,8 @@ def numbers(
     Raises:
         InputError: naming the option.
     """
-    parts, scales = re.split(separator, text.strip()), [1.0]
-    if unit == "mm":
-        found = [re.fullmatch(r"(.*?[0-9.]) ?(mm|cm|m|in)?", part.strip()) for part in parts]
-        parts = [part if match is None else match[1] for part, match in zip(parts, found, strict=True)]
-        units = [match[2] if match else None for match in found]
-        scales = [UNITS[unit or units[-1] or "mm"] for unit in units]
+    parts = re.split(separator, text.strip())
+    parts, scales = _without_units(parts) if unit == "mm" else (parts, [1.0] * len(parts))
     try:
         values = tuple(float(p) for p in parts)
     except ValueError:
@@ -424,7 +420,17 @@ def numbers(
     if len(values) not in count or not all(math.isfinite(v) or (endless and math.isinf(v)) for v in values):
         usual = "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers separated by commas"
         raise InputError(f"{option} must be {form or usual}, got {text!r}")
-    return values if unit != "mm" else tuple(v * scale for v, scale in zip(values, scales, strict=True))
+    return tuple(v * scale for v, scale in zip(values, scales, strict=True))
+
+
+def _without_units(parts: list[str]) -> tuple[list[str], list[float]]:
+    """Lengths without their units, and the mm of each unit."""
+    matches = [re.fullmatch(r"(.*?[0-9.]) ?(mm|cm|m|in)?", part.strip()) for part in parts]
+    units = [match[2] if match else None for match in matches]
+    return (
+        [part if match is None else match[1] for part, match in zip(parts, matches, strict=True)],
+        [UNITS[unit or units[-1] or "mm"] for unit in units],
+    )
 
 
 def size(option: str, text: str) -> tuple[float, float] | tuple[float]:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from caustic_cli.config.design import relative_to_initial
+from caustic_cli.config.exclusions import refuse_contradictions
 from caustic_cli.config.optional import (
     complete_elements,
     complete_network,
@@ -52,11 +53,13 @@ def complete(
         InputError: a value is out of range, or two contradict each other.
     """
     s, by = Settings.of(given), by or Parameters()
+    refuse_contradictions(s)
     if s.target.sheet:
         aspect, lit = _aspect_of_a_sheet(s, aspect), (1.0, 1.0)
     s = _in_colour(s) if s.target.color else s
     over = Ranges.parse(s.design.over)
     s = s.changed(screen=_placed(s, by, aspect, "z" in given.get("screen", {}), over))
+    _check_sizes(s)
     check("target.flip", s.target.flip)
     check("target.encoding", s.target.encoding)
     s = s.changed(source=complete_source(s.source, s.lens, [stage.get("source", "") for stage in s.design.stages]))
@@ -86,8 +89,6 @@ def _aspect_of_a_sheet(s: Settings, aspect: float) -> float:
 
 def _in_colour(s: Settings) -> Settings:
     """Settings with the wavelengths of a coloured picture, and a glass whose dispersion is known."""
-    if s.source.also:
-        raise InputError("[[source]] of a coloured picture must be one, whose three wavelengths are its colours")
     lens = s.lens if "index" in s.lens else s.lens.filled(glass=COLOR_GLASS)
     return s.changed(source=s.source.filled(wavelengths=RGB), lens=lens)
 
@@ -108,13 +109,17 @@ def _placed(s: Settings, by: Parameters, aspect: float, placed: bool, over: Rang
             screen = screen.changed(resolution=by.resolution)
     if over and "throw" in over.keys:
         screen = screen.changed(z=middle_distance(over, screen.z, side, by.throw is not None or placed))
+    return screen
+
+
+def _check_sizes(s: Settings) -> None:
+    """Check the sizes that are given, and the distance of the screen."""
     check("lens.size", s.lens.size)
-    if check("screen.z", screen.z) == 0:
+    if check("screen.z", s.screen.z) == 0:
         raise InputError("⟨screen.z⟩ must lie behind the lens, or before a mirror, got 0 mm")
-    for section in (screen, s.target):
+    for section in (s.screen, s.target):
         if "size" in section:
             check(f"{section.section}.size", section["size"])
-    return screen
 
 
 def complete_source(

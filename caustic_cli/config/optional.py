@@ -6,7 +6,6 @@ Each function completes its own part of the settings, if present, for `completio
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from caustic_cli.config.settings import Settings, build_source
 from caustic_cli.config.table import (
@@ -19,30 +18,9 @@ from caustic_cli.config.table import (
 )
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
-from caustic_cli.scene.elements import check_compatible_with_elements
 
 OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
 BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
-
-
-#: Settings that exclude a second target, other elements, those of them that do more than fold the axis, and free-form surfaces of
-#: theirs: with any value but the default, or with one.
-EXCLUDED_BY = {
-    "second": ("lens.mirror", "target.color", "lens.gradient", "lens.array", "design.robust", "design.network", "design.optimizer"),
-    "element": ("lens.gradient",),
-    "beside": ("design.robust", "design.waves on"),
-    "element.free": ("design.network", "design.optimizer", "target.color"),
-}
-
-
-def excluded_by(feature: str, s: Settings) -> dict[str, Any]:
-    """Paths and values of the settings that cannot be combined with a feature of EXCLUDED_BY."""
-    found = {}
-    for path, _, only in (entry.partition(" ") for entry in EXCLUDED_BY[feature]):
-        value = s.value(path)
-        if value == only if only else value != default(path):
-            found[path] = value
-    return found
 
 
 def middle_distance(over: Ranges, z: float, side: float, given: bool) -> float:
@@ -114,12 +92,6 @@ def complete_second(s: Settings) -> SecondSettings | None:
         second = second.changed(focus=check("second.focus", places[0] if len(places) == 1 else places))
     if "file" in second and "z" not in second:
         raise InputError("⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen")
-    for path in excluded_by("second", s):
-        raise InputError(
-            f"⟨{path}⟩ cannot be combined with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs"
-        )
-    if s.source.also or s.source.type == "rays":
-        raise InputError(f"⟨second.{said[0]}⟩ needs one source that is no ray file")
     return second
 
 
@@ -142,10 +114,6 @@ def complete_second_size(s: Settings) -> SecondSettings | None:
 
 def complete_elements(s: Settings) -> tuple[ElementSettings, ...]:
     """Other lenses and mirrors with their default sizes, and checks of unsupported combinations."""
-    if s.elements:
-        check_compatible_with_elements({f"second.{key}": True for key in _of_second(s)} | excluded_by("element", s))
-    if any(element.free != "none" for element in s.elements):
-        check_compatible_with_elements(excluded_by("element.free", s), free=True)
     return tuple(_complete_element(element, s) for element in s.elements)
 
 

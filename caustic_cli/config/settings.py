@@ -20,6 +20,7 @@ import tomli_w
 
 from caustic_cli import __version__
 from caustic_cli.config.table import (
+    TABLE,
     DesignSettings,
     ElementSettings,
     LensSettings,
@@ -31,6 +32,7 @@ from caustic_cli.config.table import (
     StageSettings,
     TargetSettings,
     check,
+    default,
     in_section,
 )
 from caustic_cli.errors import InputError, alternatives, near
@@ -80,6 +82,8 @@ TABLES = {
 #: Parameters from which settings are derived, such as mag: allowed in a configuration, before its first section, but not in a
 #: project.
 PARAMETERS = {key: row for key, row in in_section("").items() if row.kind != "tables"}
+#: Kinds of settings that are read as they are: type, and how messages name it.
+PLAIN = {"text": (str, "text in quotes"), "flag": (bool, "true or false")}
 
 
 def parse(text: str, where: str, parameters: bool = False) -> Given:
@@ -103,20 +107,24 @@ def parse(text: str, where: str, parameters: bool = False) -> Given:
             continue
         if section not in SCHEMA:
             raise InputError(f"{where}: [{section}] is not a section{near(section, SCHEMA)}")
-        if section == "source" and isinstance(table, list) and table and isinstance(table[0], dict):
-            table = {**table[0], "also": table[1:]}
-        if section == "element":
-            out[section] = {"list": _tables(table, where, *TABLES["element", "list"])}
-            continue
-        if not isinstance(table, dict):
-            raise InputError(f"{where}: {section} must be a section, written [{section}]")
-        out[section] = {}
-        for key, value in table.items():
-            if (section, key) in TABLES:
-                out[section][key] = _tables(value, where, *TABLES[section, key])
-                continue
-            out[section][key] = _typed(f"{where}: [{section}] {key}", key, value, SCHEMA[section])
+        out[section] = _section(section, table, where)
     return out
+
+
+def _section(section: str, table: Any, where: str) -> dict[str, Any]:
+    """The values of a section, of their types; errors as of `parse`."""
+    if section == "source" and isinstance(table, list) and table and isinstance(table[0], dict):
+        table = {**table[0], "also": table[1:]}
+    if section == "element":
+        table = {"list": table}
+    if not isinstance(table, dict):
+        raise InputError(f"{where}: {section} must be a section, written [{section}]")
+    return {
+        key: _tables(value, where, *TABLES[section, key])
+        if (section, key) in TABLES
+        else _typed(f"{where}: [{section}] {key}", key, value, SCHEMA[section])
+        for key, value in table.items()
+    }
 
 
 def toml_of(text: str, where: str) -> dict[str, Any]:
@@ -197,24 +205,25 @@ def _typed(where: str, key: str, value, keys: dict[str, Setting]):
     if key not in keys:
         raise InputError(f"{where} is not a key{near(key, keys)}")
     kind = keys[key].kind
-    if kind == "text":
-        if not isinstance(value, str):
-            raise InputError(f"{where} must be text in quotes, got {value!r}")
-        return value
-    if kind == "flag":
-        if not isinstance(value, bool):
-            raise InputError(f"{where} must be true or false, got {value!r}")
+    if kind in PLAIN:
+        type, words = PLAIN[kind]
+        if not isinstance(value, type):
+            raise InputError(f"{where} must be {words}, got {value!r}")
         return value
     if kind in ("number", "whole"):
         return _numeric(where, value, kind == "whole")
     if kind == "points":
-        points = value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
-        if not all(isinstance(p, list) and len(p) == 3 for p in points):
-            raise InputError(f"{where} must be [x, y, z] or a list of such, got {value!r}")
-        return [[_numeric(where, v, False) for v in p] for p in points]
+        return _points(where, value)
     if not isinstance(value, list) or (kind != "list" and len(value) not in (2, keys[key].both)):
         raise InputError(f"{where} must be a pair [x, y], got {value!r}")
     return [_numeric(where, v, kind == "wholes") for v in value]
+
+
+def _points(where: str, value) -> list[list[float]]:
+    points = value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
+    if not all(isinstance(p, list) and len(p) == 3 for p in points):
+        raise InputError(f"{where} must be [x, y, z] or a list of such, got {value!r}")
+    return [[_numeric(where, v, False) for v in p] for p in points]
 
 
 def _numeric(where: str, value, whole: bool):
@@ -262,6 +271,21 @@ class Settings:
         """The value of a setting, or its default, by its path in `config.table`; None in a section that is not there."""
         section, _, key = path.partition(".")
         return getattr(getattr(self, section), key, None)
+
+    def chosen(self, entry: str) -> Any:
+        """The value of a setting that is not the default, of a section or of an [[element]] table; None without one.
+
+        entry: path or section; after a blank, the only value that counts.
+        """
+        path, _, only = entry.partition(" ")
+        section, _, key = path.partition(".")
+        sections = self.elements if section == "element" else (getattr(self, section),)
+        usual = default(path) if path in TABLE else None
+        for value in (getattr(one, key, None) if key else one for one in sections):
+            plane = path == "screen.radius" and value and all(map(math.isinf, value))
+            if value and value != usual and (value == only if only else not plane):
+                return value
+        return None
 
 
 def dump(settings: Settings) -> str:
@@ -350,17 +374,17 @@ def build_gradient(lens: LensSettings) -> Gradient | None:
         InputError: terms or a file are missing, or belong to another kind.
     """
     kind, values = lens.gradient, content(lens, "index_file", np.ndarray)
-    if kind is None and not {"gradient_terms", "index_file"} & {*lens}:
-        return None
     if kind is not None:
         check("lens.gradient", kind)
-    if "gradient_terms" in lens and kind not in KINDS:
-        raise InputError(f"⟨lens.gradient_terms⟩ belong to ⟨lens.gradient⟩ {', '.join(KINDS)}, got {kind or 'none'}")
-    if "index_file" in lens and kind not in ("volume", "free"):
-        raise InputError(f"⟨lens.index_file⟩ belongs to ⟨lens.gradient⟩ volume or free, got {kind or 'none'}")
+    for key, kinds, belongs, named in (
+        ("gradient_terms", KINDS, "belong", ", ".join(KINDS)),
+        ("index_file", ("volume", "free"), "belongs", "volume or free"),
+    ):
+        if key in lens and kind not in kinds:
+            raise InputError(f"⟨lens.{key}⟩ {belongs} to ⟨lens.gradient⟩ {named}, got {kind or 'none'}")
     if kind == "volume" and values is None:
         raise InputError("⟨lens.gradient⟩ volume needs ⟨lens.index_file⟩, a .npy of control values")
-    if kind is not None and kind in KINDS:
+    if kind in KINDS:
         return Gradient(kind, lens.gradient_terms or ())
     return None if values is None else Gradient("volume", (), values)
 
@@ -389,11 +413,6 @@ def build_scene(settings: Settings) -> Scene:
         build_second(settings),
         tuple(_component(element, settings.lens.wavelength) for element in settings.elements),
     )
-
-
-def accompanied(s: Settings) -> bool:
-    """Whether a scene has other elements that do more than fold the axis; from complete settings."""
-    return bool(s.elements and build_scene(s).unfolded.elements)
 
 
 def _component(element: ElementSettings, wavelength: float) -> Component:
@@ -453,7 +472,7 @@ def build_screen(screen: ScreenSettings) -> Screen:
 
 def build_light(settings: Settings) -> Light:
     """Wavelengths and polarisation of the [source] section, combined for several sources."""
-    return sources.light_of_all(settings.source, settings.target.color)
+    return sources.several.light_of_all(settings.source, settings.target.color)
 
 
 def refuse_unused(source: Mapping[str, Any], given: Iterable[str], stages: Sequence[str | None] = ()) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from caustic_cli.config.default_stages import LEAST_WAVES, Table, on_waves, wave_refinement
-from caustic_cli.config.settings import Settings, accompanied, build_lens, build_light, build_screen, build_source
-from caustic_cli.errors import InputError
+from caustic_cli.config.exclusions import refuse_excluded, why_excluded
+from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen, build_source
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Scene, Source
 
@@ -22,45 +22,16 @@ def without_waves(s: Settings, given: bool) -> str:
         return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
     if (seen := _resolution(s, build_source(s.source))).source > seen.pixel:
         return "that of a source whose blur is wider than a pixel takes many times as long; ⟨waves⟩ on refines it all the same"
-    return _not_by_default(s) or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; ⟨waves⟩ on takes it"
-
-
-def _not_by_default(s: Settings) -> str:
-    """The feature for which `waves = "auto"` never refines the wave image, and how to include it; "" if there is none."""
-    if "gradient" in s.lens:
-        return "wave images are implemented for homogeneous lenses only"
-    if accompanied(s):
-        return "wave images are implemented for a single lens only"
-    if s.source.type == "rays":
-        return "a ray file contains no phase"
-    if s.source.also:
-        return "light of several sources is refined by rays alone"
-    if s.design.network != "none":
-        return "a network is trained on rays alone; ⟨network⟩ none refines it"
-    if s.design.optimizer != "lbfgs":
-        return f"{s.design.optimizer} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it"
-    if build_screen(s.screen).curved:
-        return "a curved screen has no wave image"
-    if max(s.lens.array) > 1:
-        return "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on refines it"
-    if any(s.screen.tilt):
-        return "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same"
-    return ""
+    excluded = why_excluded("design.waves auto", s)
+    return excluded or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; ⟨waves⟩ on takes it"
 
 
 def wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Table]:
     """Stages that refine the wave image after the ray image, on request or where diffraction matters."""
     lens, screen, asked = s.lens, s.screen, s.design.waves
-    without = {
-        " needs network none: the wave image is refined by control heights": s.design.network != "none",
-        " needs a homogeneous lens: with a gradient index there is no wave image": "gradient" in lens,
-        ": a ray file contains no phase, so that it has no wave image to refine": source.rays is not None,
-        " needs a plane screen: a curved one has no wave image to refine": build_screen(screen).curved,
-        " needs one source: light of several is refined by rays alone": len(source.members) > 1,
-    }
-    if asked == "on" and (why := [words for words, found in without.items() if found]):
-        raise InputError(f"⟨design.waves⟩ on{why[0]}")
-    if asked == "off" or (asked == "auto" and _not_by_default(s)):
+    if asked == "on":
+        refuse_excluded("design.waves on", s)
+    elif asked == "off" or why_excluded("design.waves auto", s):
         return []
     seen = _resolution(s, source)
     if asked == "auto" and (seen.source > seen.pixel or not seen.matters):

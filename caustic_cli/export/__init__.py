@@ -20,14 +20,10 @@ FORMATS = {
     "gcode": (".nc", "milling.gcode", "program for a three-axis mill"),
     "mitsuba": (".xml", "mitsuba", "the whole scene for Mitsuba 3, ready to run, with two meshes beside it"),
 }
-#: Formats that hold a single refractive index.
-ONE_INDEX = ("lighttools", "zemax", "mitsuba")
 MESHES = ("stl", "ply", "obj", "mitsuba")
 #: Formats of solids, in which a mirror gets a back; formats in the orientation of machining; and formats that support moulds.
 SOLIDS, AS_CUT = ("step", "stl", "ply", "obj"), ("heightmap", "gcode")
 MOULDS = (*SOLIDS, *AS_CUT)
-#: Formats that support two free-form sides.
-TWO_SIDED = ("lighttools", *SOLIDS, "mitsuba")
 #: Formats with a tolerance, and formats without samples.
 WITHIN, UNSAMPLED = (*MESHES, "lighttools", "step", "heightmap", "gcode"), ("step", "gcode")
 #: Default limit of the file size, bytes.

@@ -23,6 +23,7 @@ from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export import reading
 from caustic_cli.export.reading import Readings
+from caustic_cli.export.supported import EXPORT
 from caustic_cli.export.surface import Sampling, control_points, sample_grid, samplings
 from caustic_cli.io.files import MARK, atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -261,9 +262,8 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
     Raises:
         InputError: the format does not support this type of source.
     """
+    EXPORT["lighttools"].refuse(scene, format="lighttools")
     source = scene.source
-    if source.kind not in _KEYS:
-        raise InputError(f"⟨format⟩ lighttools does not support sources of type {source.kind}")
     return {
         "source_type": np.array(source.kind),
         "source_positions": source.points()[0],

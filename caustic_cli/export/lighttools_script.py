@@ -15,13 +15,11 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.errors import InputError
 from caustic_cli.export.surface import Sampling, SurfaceGrid, sample_grid
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import atomic_file, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
-from caustic_cli.scene.features import special_features
 
 #: Points of the flat entrance along each axis.
 FLAT = 5
@@ -148,35 +146,9 @@ def companions(path: str | Path) -> tuple[Path, Path]:
     return path.with_suffix(".py"), path.with_suffix(".lts.txt")
 
 
-def refuse(scene: Scene) -> None:
-    """Refuse a scene that the script does not support.
-
-    Raises:
-        InputError: naming what is not supported.
-    """
-    source, beyond = scene.source, special_features(scene)
-    if beyond:
-        raise InputError(
-            f"⟨script⟩ builds clear lenses and straight screens, not {', '.join(beyond)}, which the archive alone holds"
-        )
-    if len(source.members) > 1:
-        raise InputError("⟨script⟩ builds one source, so that several, which the archive alone holds, cannot be written")
-    if scene.light.unit != "W":
-        raise InputError(f"⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written")
-    if source.profile is not None:
-        raise InputError("⟨script⟩: its source is uniform, so one with a profile cannot be written")
-    if source.brightness is not None or source.rays is not None or not isinstance(source.intensity, str):
-        raise InputError(
-            "⟨script⟩: its source is evenly bright and uniform or Lambertian, so a picture, a table or a ray file cannot be written"
-        )
-    if source.extent[0] != source.extent[1]:
-        raise InputError("⟨script⟩: its disc is round, so an elliptical one cannot be written")
-    if scene.lens.opening.round:
-        raise InputError("⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written")
-
-
 def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None) -> None:
-    """Write script and block for an archive written by `write_lighttools` with the same arguments, of a scene that passes `refuse`.
+    """Write script and block for an archive written by `write_lighttools` with the same arguments, of a scene that
+    `supported.SCRIPT` supports.
 
     Raises:
         InputError: the files cannot be written.

@@ -28,13 +28,13 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.errors import InputError
 from caustic_cli.export import mesh
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.lattice import LATTICES, Patch, triangles
 from caustic_cli.export.mesh import patches, refuse_open, rim_of, walls
 from caustic_cli.export.ply import FACE, write_mesh
 from caustic_cli.export.reading import Readings
+from caustic_cli.export.supported import EXPORT
 from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import write_bytes
@@ -43,10 +43,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Aperture, CircularAperture, Lens, Scene, Screen
 from caustic_cli.scene.elements import surface_name
-from caustic_cli.scene.features import special_features
 
-#: Features beyond a basic scene that are written.
-WRITTEN = ("a mirror", "a shifted screen")
 #: Samples per pixel of the scene, Mitsuba's `spp`.
 SAMPLES = 256
 #: Distance of the collimated emitter before the entrance, mm; width of the holder over that of the lens.
@@ -326,19 +323,13 @@ def _light(scene: Scene) -> list[str]:
     Raises:
         InputError: Mitsuba has no equivalent emitter.
     """
-    beyond = [name for name in special_features(scene) if name not in WRITTEN]
-    if beyond:
-        raise InputError(f"⟨format⟩ mitsuba is written for clear lenses and straight screens, not {', '.join(beyond)}")
-    if scene.source.kind not in _EMITTERS:
-        raise InputError(f"⟨format⟩ mitsuba does not support sources of type {scene.source.kind}")
+    EXPORT["mitsuba"].refuse(scene, format="mitsuba")
     return _EMITTERS[scene.source.kind](scene)
 
 
 def _collimated(scene: Scene) -> list[str]:
     """Collimated emitter of a plane wave, as wide as the lens."""
     source, pupil = scene.source, scene.pupil
-    if source.profile is not None:
-        raise InputError("⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
     (rx, ry), radiance = pupil.half_size, real(source.power / pupil.aperture.area)
     return [
         f'<shape type="{_FLATS[pupil.aperture.name].shape}" id="light">',
@@ -352,15 +343,6 @@ def _collimated(scene: Scene) -> list[str]:
 def _area(scene: Scene) -> list[str]:
     """Lambertian area emitter of a disc."""
     source, pupil = scene.source, scene.pupil
-    if source.distant or source.intensity != "lambertian" or source.cone is not None:
-        raise InputError(
-            "⟨format⟩ mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at"
-            " infinity; render ⟨verify⟩ mitsuba traces them all"
-        )
-    if source.brightness is not None:
-        raise InputError("⟨format⟩ mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written")
-    if not min(source.size) > 0:
-        raise InputError("⟨format⟩ mitsuba: its disc shines by its area, so one without any cannot be written")
     (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(pupil)
     radiance = source.power / (
         math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2
@@ -377,8 +359,6 @@ def _area(scene: Scene) -> list[str]:
 def _spots(scene: Scene) -> list[str]:
     """A spot emitter per point; its falloff begins beyond the cone."""
     source, pupil = scene.source, scene.pupil
-    if source.intensity != "uniform":
-        raise InputError("⟨format⟩ mitsuba: its spots shine evenly, so points of another intensity cannot be written")
     cone = source.cone_over(pupil)
     lines, degrees = [], math.degrees(cone)
     for (x, y, z), power in zip(source.positions, source.powers, strict=True):

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export import AS_CUT, FORMATS, MOULDS, ONE_INDEX, SOLIDS
+from caustic_cli.export import AS_CUT, MOULDS, SOLIDS
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
@@ -63,7 +63,10 @@ def part_of(
     """
     lens, heights = scene.lens, heights.detach().double().cpu()
     kind = "mould" if mould else lens.kind
-    _refuse(format, lens, kind, block)
+    if mould and format not in MOULDS:
+        raise InputError(f"⟨mould⟩ belongs to ⟨format⟩ {', '.join(MOULDS)}, got {format}")
+    if block is not None and kind == "lens":
+        raise InputError("⟨block⟩ belongs to mirrors and moulds: a lens ends at its flat entrance")
     if kind == "lens":
         return Part(scene, field, heights, kind)
     room = BLOCK * max(lens.size) if block is None else block
@@ -74,16 +77,6 @@ def part_of(
         return Part(replace(scene, lens=replace(lens, z_in=back)) if format in SOLIDS else scene, field, heights, kind)
     field, heights = turned(field, heights)
     return Part(_alone(scene, float(heights.min()) - room), field, heights, kind, True)
-
-
-def _refuse(format: str, lens: Lens, kind: str, block: float | None) -> None:
-    if lens.gradient is not None and format in ONE_INDEX:
-        shapes = ", ".join(name for name in FORMATS if name not in ONE_INDEX)
-        raise InputError(f"⟨format⟩ {format} holds one index, and this lens' varies; {shapes} hold its shape alone")
-    if kind == "mould" and format not in MOULDS:
-        raise InputError(f"⟨mould⟩ belongs to ⟨format⟩ {', '.join(MOULDS)}, got {format}")
-    if block is not None and kind == "lens":
-        raise InputError("⟨block⟩ belongs to mirrors and moulds: a lens ends at its flat entrance")
 
 
 def turned(field: HeightField, heights: Tensor) -> tuple[HeightField, Tensor]:

@@ -43,7 +43,17 @@ from caustic_cli.optics.surfaces import HeightField, Plane
 from caustic_cli.optics.system import ENTRANCE, EXIT, Element, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene
+from caustic_cli.scene.traits import Capability
 
+INDEX_DESIGN = Capability(
+    "design of a gradient index",
+    {
+        "light not parallel": "⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane",
+        **dict.fromkeys(
+            ("mirror", "coloured picture"), "⟨lens.gradient⟩ free is designed for lenses, and for pictures without colours"
+        ),
+    },
+)
 #: Fixed-point iterations of the initial sines.
 SINES = 3
 #: Rays per pixel of the optimisation; oversampling of the render along each axis.
@@ -119,50 +129,58 @@ def design_gradient_index(
     def volume(values: Tensor) -> SplineIndex:
         return SplineIndex(values, lens.half_size, lens.offset.thickness - lens.z_in)
 
-    begun = volume(layer[:, :, None].expand(-1, -1, layers).contiguous())
-    objective = _IndexObjective(scene, target, begun, rays or RAYS_A_PIXEL * math.prod(scene.screen.resolution), seed)
-    low_net, high_net = (torch.full(control, v, dtype=torch.float64) for v in (low, high))
-    nets = [FreeHeights(low_net, high_net, layer, laplacian=True) for _ in range(layers)]
-    seen: dict[float, Evaluation] = {}
-
-    def controls(x: Tensor) -> Tensor:
-        for one, y in zip(nets, x.view(layers, *control), strict=True):
-            one.y.data = y.clone()
-        return torch.stack([one() for one in nets], -1)
+    initial = volume(layer[:, :, None].expand(-1, -1, layers).contiguous())
+    objective = _IndexObjective(scene, target, initial, rays or RAYS_A_PIXEL * math.prod(scene.screen.resolution), seed)
+    values = _Layers(layer, layers, (low, high))
+    evaluations: dict[float, Evaluation] = {}
 
     def evaluate(x: Tensor) -> tuple[float, Tensor]:
-        values = controls(x)
+        net = values.at(x)
         try:
-            found = objective.evaluate({objective.name: values.detach()})
+            result = objective.evaluate({objective.name: net.detach()})
         except NoLight:
             if search.f is None:
                 raise
             return math.inf, torch.zeros_like(x)  # treated as too long by the line search
-        seen[found.loss] = found
-        by = torch.autograd.grad(values, [one.y for one in nets], found.gradients[objective.name])
-        return found.loss, torch.stack(by).reshape(-1)
+        evaluations[result.loss] = result
+        return result.loss, values.pulled_back(net, result.gradients[objective.name])
 
     search = LBFGS(evaluate, torch.zeros(layers * math.prod(control), dtype=torch.float64))
     history: list[tuple[float, float]] = []
     for k in range(iterations):
-        seen.clear()
+        evaluations.clear()
         if stop() or not search.step():
             break
         assert search.f is not None
-        found = seen[search.f]
-        history.append((search.f, found.on_screen))
-        on_iteration(k + 1, search.f, found.on_screen, found.image)
+        result = evaluations[search.f]
+        history.append((search.f, result.on_screen))
+        on_iteration(k + 1, search.f, result.on_screen, result.image)
     with torch.no_grad():
-        return GradientIndexDesign(volume(controls(search.x)), begun, tuple(history))
+        return GradientIndexDesign(volume(values.at(search.x)), initial, tuple(history))
+
+
+class _Layers:
+    """Control values (n, m, layers) within limits as a function of unknowns x (layers n m,), which are 0 for layers all alike."""
+
+    def __init__(self, layer: Tensor, layers: int, limits: tuple[float, float]):
+        low, high = (torch.full_like(layer, limit, dtype=torch.float64) for limit in limits)
+        self.nets = [FreeHeights(low, high, layer, laplacian=True) for _ in range(layers)]
+
+    def at(self, x: Tensor) -> Tensor:
+        """The values at x."""
+        for net, y in zip(self.nets, x.view(len(self.nets), *self.nets[0].y.shape), strict=True):
+            net.y.data = y.clone()
+        return torch.stack([net() for net in self.nets], -1)
+
+    def pulled_back(self, values: Tensor, gradient: Tensor) -> Tensor:
+        """Gradient by x from that by the values, which are the last ones of `at`."""
+        return torch.stack(torch.autograd.grad(values, [net.y for net in self.nets], gradient)).reshape(-1)
 
 
 def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], limits: tuple[float, float], cells: int) -> Tensor:
     """Control values (n, m) of the initial index within its limits, independent of z; errors as of `design_gradient_index`."""
     lens, (low, high) = scene.lens, limits
-    if not scene.source.collimated:
-        raise InputError("⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane")
-    if lens.mirror or scene.colored:
-        raise InputError("⟨lens.gradient⟩ free is designed for lenses, and for pictures without colours")
+    INDEX_DESIGN.refuse(scene)
     if not 1.0 <= low < high <= 5.0:
         raise InputError(f"⟨lens.index_range⟩ must ascend within 1 to 5, got [{low:g}, {high:g}]")
     if not lens.offset.thickness > lens.z_in:

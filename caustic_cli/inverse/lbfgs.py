@@ -111,32 +111,55 @@ class LBFGS:
 
     def _search(self, d: Tensor, slope0: float, t: float) -> bool:
         """Move to a point along d that meets the strong Wolfe conditions, or the best lower one found."""
-        f0 = self.f
-        low = (0.0, f0, slope0)  # step, value, slope at the best point that satisfies Armijo
-        high = None
-        best = None
+        assert self.f is not None
+        bracket, best, lowest = _Bracket(self.f, slope0), None, self.f
         for _ in range(MAX_EVALUATIONS):
             x = self.x + t * d
             f, g = self._evaluate(x)
             if not math.isfinite(f) or not bool(torch.isfinite(g).all()):
-                high = (t, math.inf, math.inf)
-                t = low[0] + 0.1 * (t - low[0])
+                t = bracket.shortened(t)
                 continue
-            slope = float(g @ d)
-            if f < f0 and (best is None or f < best[1]):
-                best = (x, f, g)
-            if f > f0 + ARMIJO * t * slope0 or (low[0] > 0 and f >= low[1]):
-                high = (t, f, slope)
-            elif abs(slope) <= -CURVATURE * slope0:
+            if f < lowest:
+                best, lowest = (x, f, g), f
+            following = bracket.step_after(t, f, float(g @ d))
+            if following is None:
                 return self._accept(x, f, g)
-            elif slope * ((high[0] if high else math.inf) - low[0]) >= 0:
-                high, low = low, (t, f, slope)
-            else:
-                low = (t, f, slope)
-            t = _interpolate(low, high) if high else 4.0 * t
-            if high and abs(high[0] - low[0]) < 1e-10 * max(high[0], low[0]):
+            if bracket.closed:
                 break
+            t = following
         return self._accept(*best) if best else False
+
+
+class _Bracket:
+    """Step lengths between which some meet the strong Wolfe conditions, for a value and a slope at 0."""
+
+    def __init__(self, f0: float, slope0: float):
+        self.f0, self.slope0 = f0, slope0
+        #: Step, value, slope at the best point that satisfies Armijo's condition, and at the other end, if there is one.
+        self.low = (0.0, f0, slope0)
+        self.high: tuple[float, float, float] | None = None
+
+    def step_after(self, t: float, f: float, slope: float) -> float | None:
+        """The step to try after one to this value and slope; None if that meets the conditions."""
+        if f > self.f0 + ARMIJO * t * self.slope0 or (self.low[0] > 0 and f >= self.low[1]):
+            self.high = (t, f, slope)
+        elif abs(slope) <= -CURVATURE * self.slope0:
+            return None
+        elif slope * ((self.high[0] if self.high else math.inf) - self.low[0]) >= 0:
+            self.high, self.low = self.low, (t, f, slope)
+        else:
+            self.low = (t, f, slope)
+        return _interpolate(self.low, self.high) if self.high else 4.0 * t
+
+    def shortened(self, t: float) -> float:
+        """The step to try after one to a value that is not finite."""
+        self.high = (t, math.inf, math.inf)
+        return self.low[0] + 0.1 * (t - self.low[0])
+
+    @property
+    def closed(self) -> bool:
+        """Whether its ends are equal but for rounding."""
+        return self.high is not None and abs(self.high[0] - self.low[0]) < 1e-10 * max(self.high[0], self.low[0])
 
 
 def _interpolate(a: tuple, b: tuple) -> float:

@@ -31,11 +31,13 @@ from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
+from caustic_cli.scene.traits import Capability
 
 NEEDS_DISTANT_SOURCE = (
     "⟨lens.array⟩ needs light from infinity, which reaches every lenslet alike: ⟨+source.type⟩ plane, or a disc with"
     " ⟨+source.angle⟩"
 )
+LENSLETS = Capability("lenslet arrays", {"near source": NEEDS_DISTANT_SOURCE})
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +66,7 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
         InputError: light does not come from infinity, or none falls on a lenslet.
     """
     lens, screen = scene.lens, scene.screen
-    if not scene.source.distant:
-        raise InputError(NEEDS_DISTANT_SOURCE)
+    LENSLETS.refuse(scene)
     steps = [(n - 1) // k for n, k in zip(control or lens.control, lens.array, strict=True)]
     size = (lens.size[0] / lens.array[0], lens.size[1] / lens.array[1])
     own = replace(lens, size=size, control=(steps[0] + 1, steps[1] + 1), array=(1, 1))

@@ -16,6 +16,16 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.distribution import relative
+from caustic_cli.scene.traits import Capability
+
+REACHABILITY = Capability(
+    "check of what refraction can reach",
+    {
+        "mirror": "reflection deflects by any angle",
+        "ray file": "its rays are followed by the design itself",
+        "separate places": "each of its sources would have to be followed",
+    },
+)
 
 #: Points along each axis of the entrance, and of the picture at most.
 ENTRANCE, PICTURE = 17, 15
@@ -32,7 +42,7 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
         InputError: no light falls on the lens, or none of it can be deflected far enough.
     """
     lens, limit = scene.lens, scene.lens.interaction.largest_deflection(scene.lens.index)
-    if limit >= math.pi or scene.source.rays is not None or scene.source.apart:
+    if not REACHABILITY.supports(scene):
         return
     goal, most, lit = _lit(scene, target), -1.0, False
     for x, y, d in _in_glass(scene, max(1, PAIRS // goal.shape[1])):

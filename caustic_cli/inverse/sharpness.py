@@ -28,7 +28,7 @@ from caustic_cli.inverse.source_limits import SHIFTS
 from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread
 from caustic_cli.scene import Disc, PlaneWave, Scene
-from caustic_cli.scene.sources.disc import SUN
+from caustic_cli.scene.sources.section import SUN
 
 #: RMS error of a picture that counts as sharp, in parts of its contrast: 20 dB below it.
 SHARP = 0.1

@@ -28,6 +28,23 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Aperture, CircularAperture, Scene, Source
 from caustic_cli.scene.aperture import UNBOUNDED
 from caustic_cli.scene.sources.distribution import relative
+from caustic_cli.scene.traits import Capability
+
+LIMITS = Capability(
+    "limits by the source",
+    {
+        "separate places": "the light of separate sources has no common limit",
+        "other elements": "they may change the etendue between lens and screen",
+    },
+)
+CONVOLUTION = Capability(
+    "design by convolution with the source",
+    {
+        "separate places": "its places have images of their own",
+        **dict.fromkeys(("tilted screen", "curved screen"), "the image of the source varies over the screen"),
+        **dict.fromkeys(("other elements", "folded axis"), "the blur by the lens alone is not that on the screen"),
+    },
+)
 
 #: The blur is taken as a convolution where the deviation from it is at most this fraction of its half width.
 SHIFTS = 0.35
@@ -68,7 +85,7 @@ def performance_limits(scene: Scene, target: np.ndarray, steps: int | None = Non
     `deconvolved`.
     """
     scene = scene.unfolded
-    if not scene.source.extended or scene.source.apart or scene.elements:
+    if not (scene.source.extended and LIMITS.supports(scene)):
         return SourceLimits(None, None)
     images = source_images(scene)
     seen = bool(images) and LEAST_REACH * max(scene.screen.pixel) < max(images[0].reach()) <= max(scene.screen.size)
@@ -98,7 +115,7 @@ def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int
 def source_spread(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
     """The point-spread function of an extended source; None for a point source, where the blur is not well approximated by a
     convolution, where it is wider than the screen, or before several surfaces are designed."""
-    if not scene.source.extended or scene.source.apart or any(scene.screen.tilt) or scene.screen.curved or scene.elements:
+    if not (scene.source.extended and CONVOLUTION.supports(scene)):
         return None
     if heights is None and scene.joint:  # the offset of one surface does not represent a lens with several
         return None

@@ -36,9 +36,11 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.projection import ScreenProjection
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.transport import Transport, corners, solve
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
-from caustic_cli.optics.kernels.laguerre import prices
+
+laguerre = OnDemand("caustic_cli.optics.kernels.laguerre")
 
 Projection = ScreenProjection | RelayedScreen  # of a screen that is not the plane z_screen
 SMOOTHING = 2.0  # cells over which e is smoothed: at a kink of phi the spline smooths the slopes, which is no error of T
@@ -180,7 +182,7 @@ def _moved(target, pixel, potential, shift, x, y) -> tuple[np.ndarray, tuple[flo
     """The picture with each pixel moved by -shift at the point that illuminates it, padded as necessary, and its half sizes, mm."""
     shape = target.shape
     at = [(np.arange(s) + 0.5 - 0.5 * s) * w for s, w in zip(shape, pixel, strict=True)]
-    from_ = prices(potential, at[0], np.arange(shape[0] + 1) * shape[1], np.tile(at[1], shape[0]), x[:, 0], y[0])[1]
+    from_ = laguerre.prices(potential, at[0], np.arange(shape[0] + 1) * shape[1], np.tile(at[1], shape[0]), x[:, 0], y[0])[1]
     bright = target.ravel() > 0
     moves = [-s.ravel()[from_[bright]] / w for s, w in zip(shift, pixel, strict=True)]
     frame = [min(int(np.ceil(np.abs(m).max())) + 1, s) for m, s in zip(moves, shape, strict=True)]

@@ -34,8 +34,11 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.spatial import cKDTree
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.kernels import blocks, laguerre
-from caustic_cli.optics.kernels.multigrid import Multigrid, matrix
+from caustic_cli.loading import OnDemand
+
+#: Compiled on first use.
+kernels, laguerre = OnDemand("caustic_cli.optics.kernels"), OnDemand("caustic_cli.optics.kernels.laguerre")
+multigrid = OnDemand("caustic_cli.optics.kernels.multigrid")
 
 FINE = 4  # raster points per source cell along each axis, over which phi is averaged
 #: The same for Newton's method: cells of sites along a line are long and narrow, and one between the points of the raster appears
@@ -155,7 +158,7 @@ def solve(
         InputError: a density that is not 2-D, not finite, negative or black, or a size that is not positive.
     """
     began = time.perf_counter()
-    blocks()  # sets numba's number of threads to torch's
+    kernels.blocks()  # sets numba's number of threads to torch's
     f, g = _density("source", source), _density("target", target)
     (a, b), (c, d) = _halves("source", source_half), _halves("target", target_half)
     if not 0.5 <= smooth <= 16:
@@ -380,7 +383,7 @@ def _newton(psi, sites: _Sites, raster: list, light: tuple, tolerance: float, mo
     for step in range(most):
         if error < tolerance or len(psi) == 1:
             return psi, error, step
-        change, _ = Multigrid(*matrix(*graph)).solve(excess - excess.mean(), LINEAR_TOLERANCE)
+        change, _ = multigrid.Multigrid(*multigrid.matrix(*graph)).solve(excess - excess.mean(), LINEAR_TOLERANCE)
         change -= change.mean()
         length, best = 1.0, None
         while length > 0.05:

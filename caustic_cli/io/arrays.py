@@ -116,6 +116,17 @@ def _header(file: BinaryIO, size: int, unread: list[int], accepted: str, exact: 
     Raises:
         ValueError: the header is invalid, of another dtype, or declares more data than there are.
     """
+    dtype, order, sizes = _described(_header_text(file))
+    wanted, there = math.prod(sizes) * dtype.itemsize, size - file.tell()
+    if wanted > there or (exact and wanted < there) or not wanted:
+        raise ValueError(f"{there:,} bytes of data, where an array of shape {sizes} has {wanted:,}")
+    if wanted > MOST_BYTES:
+        raise ValueError(f"{wanted:,} bytes of data, where at most {MOST_BYTES:,} are read")
+    return Stored(sizes, dtype, order == "True", file, unread, accepted)
+
+
+def _header_text(file: BinaryIO) -> str:
+    """The description of an array at the beginning of a file; errors as of `_header`."""
     start = file.read(8)
     if start[:6] != MAGIC or start[6:7] not in (b"\1", b"\2", b"\3"):
         raise ValueError("no header of a .npy array")
@@ -123,7 +134,11 @@ def _header(file: BinaryIO, size: int, unread: list[int], accepted: str, exact: 
     length = int.from_bytes(file.read(width), "little")
     if not 0 < length <= MOST_HEADER:
         raise ValueError(f"a header of {length:,} bytes, where at most {MOST_HEADER:,} are read")
-    text = file.read(length).decode("latin-1").strip()
+    return file.read(length).decode("latin-1").strip()
+
+
+def _described(text: str) -> tuple[np.dtype, str, tuple[int, ...]]:
+    """Type, order and shape of an array, from its description; errors as of `_header`."""
     fields = text[1:-1].strip()
     found = {m[1]: m for m in _FIELD.finditer(fields)}
     if text[:1] + text[-1:] != "{}" or len(found) != 3 or _FIELD.sub("", fields):
@@ -134,13 +149,7 @@ def _header(file: BinaryIO, size: int, unread: list[int], accepted: str, exact: 
     numbers = [n.strip().rstrip("L") for n in shape.split(",")]
     if len(numbers) > MOST_AXES or any(len(n) > MOST_DIGITS for n in numbers):
         raise ValueError("a shape beyond all bounds")
-    dtype, sizes = np.dtype(kind), tuple(int(n) for n in (numbers if numbers[-1] else numbers[:-1]))
-    wanted, there = math.prod(sizes) * dtype.itemsize, size - 8 - width - length
-    if wanted > there or (exact and wanted < there) or not wanted:
-        raise ValueError(f"{there:,} bytes of data, where an array of shape {sizes} has {wanted:,}")
-    if wanted > MOST_BYTES:
-        raise ValueError(f"{wanted:,} bytes of data, where at most {MOST_BYTES:,} are read")
-    return Stored(sizes, dtype, order == "True", file, unread, accepted)
+    return np.dtype(kind), order, tuple(int(n) for n in (numbers if numbers[-1] else numbers[:-1]))
 
 
 @contextlib.contextmanager

@@ -22,9 +22,8 @@ from caustic_cli.io.files import naming, open_regular
 ACCEPTED = "a program of G0 and G1 moves in millimetres is needed"
 #: Largest program read, bytes: some 20 million moves.
 MOST_BYTES = 1 << 29
-#: G words without influence on the tool path, or with the assumed modes; ignored letters.
-PLAIN = {"G17", "G21", "G40", "G49", "G54", "G61", "G64", "G80", "G90", "G94"}
-PASSED_OVER = set("FSTMNH")
+#: G words without influence on the tool path, or with the assumed modes; and ignored letters.
+IGNORED = {"G17", "G21", "G40", "G49", "G54", "G61", "G64", "G80", "G90", "G94", *"FSTMNH"}
 
 _WORD = re.compile(r"([A-Z])\s*([+-]?(?:\d+\.?\d*|\.\d+))")
 _COMMENT = re.compile(r"\([^()]*\)|;.*")
@@ -56,60 +55,78 @@ class Program:
     turned: bool | None
 
 
+class _Interpreter:
+    """State of a machine that reads a program line by line."""
+
+    def __init__(self) -> None:
+        #: What the comments say, by pattern.
+        self.comments: dict[re.Pattern, str] = {}
+        #: Kind and radius of each tool, and its moves: x, y, z, whether rapid.
+        self.tools: list[tuple[str, float | None]] = [("", None)]
+        self.moves: list[list[tuple]] = [[]]
+        #: G0 or G1, None before the first; the position, nan where unknown.
+        self.motion: str | None = None
+        self.position = [math.nan] * 3
+
+    def read(self, line: str, number: int) -> None:
+        """Read a line; InputError if it is not supported."""
+        if "(" in line:
+            self._comment(line, number)
+        line = _COMMENT.sub("", line).upper().strip().strip("%")
+        if not line:
+            return
+        if _WORD.sub("", line).strip():
+            raise InputError(f"line {number}: {line!r} is no block of words; {ACCEPTED}")
+        moved = False
+        for letter, value in _WORD.findall(line):
+            if letter in "XYZ":
+                self.position["XYZ".index(letter)] = float(value)
+                moved = True
+            else:
+                self._mode(letter, value, number)
+        if moved:
+            if self.motion is None:
+                raise InputError(f"line {number}: a place without G0 or G1; {ACCEPTED}")
+            self.moves[-1].append((*self.position, self.motion == "G0"))
+
+    def _comment(self, line: str, number: int) -> None:
+        for pattern in (_STOCK, _ZERO, _TURNED):
+            if said := pattern.search(line):
+                self.comments[pattern] = said[1]
+        if tool := _TOOL.search(line):
+            self.tools.append((tool[1], _real(tool[2], number)))
+            self.moves.append([])
+            self.position = [math.nan] * 3  # unknown after a tool change
+
+    def _mode(self, letter: str, value: str, number: int) -> None:
+        code = f"G{float(value):g}" if letter == "G" else letter
+        if code in ("G0", "G1"):
+            self.motion = code
+        elif code not in IGNORED:
+            raise InputError(f"line {number}: {code} is not read; {ACCEPTED}")
+
+
 def read_program(path: str | Path) -> Program:
     """Read a program.
 
     Raises:
         InputError: it is invalid or not supported, with the line.
     """
+    machine = _Interpreter()
     with open_regular(path, ACCEPTED, MOST_BYTES) as file, naming(path):
-        comments: dict[re.Pattern, str] = {}
-        tools: list[tuple[str, float | None]] = [("", None)]
-        moves: list[list[tuple]] = [[]]
-        motion, place = None, [math.nan] * 3
-        for number, raw in enumerate(file, 1):
-            line = raw.decode("latin-1")
-            if "(" in line:
-                for pattern in (_STOCK, _ZERO, _TURNED):
-                    if found := pattern.search(line):
-                        comments[pattern] = found[1]
-                if found := _TOOL.search(line):
-                    tools.append((found[1], _real(found[2], number)))
-                    moves.append([])
-                    place = [math.nan] * 3  # the position is unknown after a tool change
-            line = _COMMENT.sub("", line).upper().strip().strip("%")
-            if not line:
-                continue
-            words = _WORD.findall(line)
-            if _WORD.sub("", line).strip():
-                raise InputError(f"line {number}: {line!r} is no block of words; {ACCEPTED}")
-            moved = False
-            for letter, value in words:
-                if letter in "XYZ":
-                    place["XYZ".index(letter)] = float(value)
-                    moved = True
-                elif letter == "G":
-                    code = f"G{float(value):g}"
-                    if code in ("G0", "G1"):
-                        motion = code
-                    elif code not in PLAIN:
-                        raise InputError(f"line {number}: {code} is not read; {ACCEPTED}")
-                elif letter not in PASSED_OVER:
-                    raise InputError(f"line {number}: {letter} is not read; {ACCEPTED}")
-            if moved:
-                if motion is None:
-                    raise InputError(f"line {number}: a place without G0 or G1; {ACCEPTED}")
-                moves[-1].append((*place, motion == "G0"))
+        for number, line in enumerate(file, 1):
+            machine.read(line.decode("latin-1"), number)
     cuts = []
-    for (kind, radius), rows in zip(tools, moves, strict=True):
+    for (kind, radius), rows in zip(machine.tools, machine.moves, strict=True):
         table = np.array(rows, float).reshape(-1, 4)
         known = np.isfinite(table[:, :3]).all(1)  # positions with all coordinates known
         if known.any():
             cuts.append(Cut(kind, radius, table[known, :3], table[known, 3] > 0))
     if not cuts:
         raise InputError(f"{path}: moves no tool; {ACCEPTED}")
-    real = {key: _real(comments[key], 0) if key in comments else None for key in (_STOCK, _ZERO)}
-    return Program(tuple(cuts), real[_STOCK], real[_ZERO], comments[_TURNED] == "yes" if _TURNED in comments else None)
+    said = machine.comments
+    top, zero = (_real(said[key], 0) if key in said else None for key in (_STOCK, _ZERO))
+    return Program(tuple(cuts), top, zero, said[_TURNED] == "yes" if _TURNED in said else None)
 
 
 def _real(text: str, number: int) -> float:

@@ -104,8 +104,7 @@ def _said(path: Path) -> dict[str, Any]:
         if not isinstance(header, dict) or header.get("height_map") != VERSION or header.get("unit") != "mm":
             raise InputError(f"does not describe a height_map {VERSION} in mm; {ACCEPTED}")
         for key in ("z_of_zero", "mm_per_count", "quantum_mm", "x_of_column_0", "y_of_row_0"):
-            value = header.get(key)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > LENGTH:
+            if not _is_length(value := header.get(key)):
                 raise InputError(f"{key} must be a number within +-{LENGTH:g}, got {value!r}")
         if not (header["x_of_column_0"] < 0 < header["y_of_row_0"] and header["quantum_mm"] > 0):
             raise InputError("x_of_column_0 must be below 0, y_of_row_0 and quantum_mm above")
@@ -114,6 +113,10 @@ def _said(path: Path) -> dict[str, Any]:
         if "spline" in header:
             _check_net(header["spline"])
         return header
+
+
+def _is_length(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and abs(value) <= LENGTH
 
 
 def _check_net(net: object) -> None:

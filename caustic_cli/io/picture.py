@@ -167,7 +167,8 @@ def _read_npy(path: Path | Piped, color: bool) -> Picture:
     return Picture(values, "linear")
 
 
-def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> Picture:
+def _decoded(path: Path | Piped) -> Image.Image:
+    """The pixels of a file, upright."""
     with open_regular(path, ACCEPTED, MAX_BYTES) as file, naming(path):
         try:
             with warnings.catch_warnings():
@@ -179,13 +180,17 @@ def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> P
                     with _silent() if image.format == "TIFF" else nullcontext():
                         image = ImageOps.exif_transpose(image)
                         image.load()
+                return image
         except InputError:
             raise
         except Image.DecompressionBombError as error:
             raise InputError(f"is too large; at most {MAX_PIXELS} pixels (8192 x 8192) are read") from error
         except Exception as error:  # a damaged file may cause any exception in a decoder
             raise InputError(f"{undecoded(error)}; {ACCEPTED}") from error
-    encoding = "linear" if linear else "srgb"
+
+
+def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> Picture:
+    image, encoding = _decoded(path), "linear" if linear else "srgb"
     if color and image.mode != "F" and not image.mode.startswith("I"):
         return _lit(path, image, Picture(_over_ground(image, linear, white), encoding))
     if color:

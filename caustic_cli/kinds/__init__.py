@@ -6,35 +6,38 @@ a place in KINDS; nothing else asks which kind a design is of.
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import cast
+
 from caustic_cli.config.settings import Settings
 from caustic_cli.kinds.defaults import Defaults
-from caustic_cli.kinds.elements import AmongElements, FreeElements
-from caustic_cli.kinds.gradient_index import IndexPlate
-from caustic_cli.kinds.lenslet_array import LensletArray
-from caustic_cli.kinds.network_range import NetworkAmongElements, NetworkOverRange
-from caustic_cli.kinds.robust import RobustAmongElements, RobustArray, RobustSurface
 from caustic_cli.kinds.surface import Described, OneSurface
-from caustic_cli.kinds.two_sides import TwoSides
 
-#: All kinds; a design is of the first that applies.
-KINDS: tuple[type[OneSurface], ...] = (
-    IndexPlate,
-    TwoSides,
-    FreeElements,
-    NetworkAmongElements,
-    NetworkOverRange,
-    RobustAmongElements,
-    AmongElements,
-    RobustArray,
-    LensletArray,
-    RobustSurface,
-    OneSurface,
+#: All kinds beside a single surface, each with the setting or section without which it does not apply and is not loaded; a design
+#: is of the first that applies.
+KINDS = (
+    ("lens.gradient", "gradient_index.IndexPlate"),
+    ("second", "two_sided.TwoSides"),
+    ("element", "elements.FreeElements"),
+    ("design.over", "network_range.NetworkAmongElements"),
+    ("design.over", "network_range.NetworkOverRange"),
+    ("design.robust", "robust.RobustAmongElements"),
+    ("element", "elements.AmongElements"),
+    ("design.robust", "robust.RobustArray"),
+    ("lens.array", "lenslet_array.LensletArray"),
+    ("design.robust", "robust.RobustSurface"),
 )
 
 
 def kind_of(s: Settings) -> type[OneSurface]:
     """The kind of the design of these settings."""
-    return next(kind for kind in KINDS if kind.applies(s))
+    for setting, name in KINDS:
+        if s.chosen(setting):
+            module, _, title = name.partition(".")
+            kind = cast(type[OneSurface], getattr(import_module(f"{__name__}.{module}"), title))
+            if kind.applies(s):
+                return kind
+    return OneSurface
 
 
 def problem_of(described: Described, device: str = "cpu") -> OneSurface:

@@ -8,15 +8,13 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config.default_stages import Table, two_sided
-from caustic_cli.config.optional import excluded_by
-from caustic_cli.config.settings import Settings, accompanied
+from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import departure_bound, sphere_net
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.several_surfaces import SeveralSurfaces
 from caustic_cli.kinds.surface import OneSurface
 from caustic_cli.optics.resolution import Resolution
-from caustic_cli.scene.elements import check_compatible_with_elements
 
 
 class AmongElements(OneSurface):
@@ -25,12 +23,6 @@ class AmongElements(OneSurface):
     @classmethod
     def applies(cls, s: Settings) -> bool:
         return bool(s.elements)
-
-    @classmethod
-    def complete(cls, d: Defaults) -> None:
-        super().complete(d)
-        if (wrong := excluded_by("beside", d.s)) and accompanied(d.s):
-            check_compatible_with_elements(wrong)
 
     @classmethod
     def spread(cls, d: Defaults) -> bool:

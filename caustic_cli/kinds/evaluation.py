@@ -14,13 +14,14 @@ from torch import Tensor
 
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.loss_terms import parse
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
-from caustic_cli.optics.waves.image import WaveImage
 from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import RELATIVE_NOISE, evaluation_rays, retrace
-from caustic_cli.studies.waves import unseen_figures, wave_figures
+
+by_waves = OnDemand("caustic_cli.studies.waves")
 
 #: Losses that measure the error of the picture alone; others may increase it in exchange for another objective.
 LIKENESS = {"rms", "rms-light", "throughput"}
@@ -48,11 +49,11 @@ class Seen(NamedTuple):
     """A retraced lens: its ray image, wave image if refined, and figures."""
 
     exposure: Image
-    light: WaveImage | None
+    light: Any | None
     figures: dict[str, Any]
 
 
-class Evaluator:
+class LensEvaluation:
     """Figures of a finished lens, and the lens that is kept; see `OneSurface.evaluate`."""
 
     def __init__(self, designer: Designer, state: State, rays: int, size: tuple[float, float], timed: bool):
@@ -84,7 +85,7 @@ class Evaluator:
         if not self.refined:
             return Seen(exposure, None, figures)
         problem = self.problem
-        light, more = wave_figures(
+        light, more = by_waves.wave_figures(
             problem.scene, self.field, heights.to(problem.device), self.target, self.seen, required=problem.options.waves
         )
         return Seen(exposure, light, figures | more)
@@ -130,7 +131,7 @@ class Evaluator:
         """Add the error of the wave image at wavelengths that were not refined."""
         if self.light is not None:
             heights = self.state.heights.to(self.problem.device)
-            self.figures |= unseen_figures(self.problem.scene, self.field, heights, self.target)
+            self.figures |= by_waves.unseen_figures(self.problem.scene, self.field, heights, self.target)
 
     def result(self) -> Evaluated:
         """The result."""

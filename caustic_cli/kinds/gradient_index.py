@@ -16,7 +16,7 @@ import torch
 
 from caustic_cli.config.default_stages import refinement, transport_cells
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import LensSettings, ScreenSettings, check, check_all, default
+from caustic_cli.config.table import LensSettings, ScreenSettings, check, check_all
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.gradient_index import design_gradient_index
@@ -42,8 +42,6 @@ class IndexPlate(OneSurface):
     @classmethod
     def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
         """A plane-parallel blank; its sides have the smallest control net."""
-        if lens.mirror:
-            raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
         lens = lens.filled(radius=(math.inf, math.inf))
         if any(map(math.isfinite, lens.radius)):
             raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {list(lens.radius)}")
@@ -63,21 +61,9 @@ class IndexPlate(OneSurface):
         s, lens, design = d.s, d.lens, d.design
         if not d.source.collimated:
             raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s.source.type}")
-        if max(lens.array) > 1:
-            raise InputError("⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat")
-        if s.target.color:
-            raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
-        if robust := design.robust:
-            raise InputError(
-                f"⟨design.robust⟩ {robust} averages over errors of a designed surface, but ⟨lens.gradient⟩ free designs the index"
-            )
+        check("design.waves", design.waves)
         if design.get("start", "offset") not in ("offset", "transport"):
             raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design.start}")
-        for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
-            if design[key] != only:
-                raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
-        if check("design.waves", design.waves) == "on":
-            raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
         d.set_design(start="offset")  # of the surface, which is flat; the index starts from optimal transport
         d.fill_design(preconditioner="laplacian")
         if "stages" not in design:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config.default_stages import Table, each_lenslet
+from caustic_cli.config.exclusions import refuse_excluded
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import InitialSurface
@@ -49,11 +50,7 @@ class LensletArray(OneSurface):
     @classmethod
     def refuse_settings(cls, d: Defaults) -> None:
         super().refuse_settings(d)
-        if d.design.start == "offset" or not d.plain:
-            raise InputError(
-                "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none"
-                " and optimizer lbfgs"
-            )
+        refuse_excluded("lens.array", d.s)
         if d.design.start == "transport" and not d.source.distant:
             raise InputError(NEEDS_DISTANT_SOURCE)
 

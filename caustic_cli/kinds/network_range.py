@@ -54,8 +54,6 @@ class NetworkOverRange(OneSurface):
     def complete(cls, d: Defaults) -> None:
         super().complete(d)
         _refuse_idle_inputs(d.trained, d.design.initial)
-        if d.design.robust:
-            raise InputError("⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already")
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:

@@ -45,17 +45,18 @@ from caustic_cli.inverse.source_limits import (
     source_spread,
 )
 from caustic_cli.inverse.target import grey
-from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.kinds.defaults import Defaults
-from caustic_cli.kinds.evaluation import Evaluated, Evaluator
+from caustic_cli.kinds.evaluation import Evaluated, LensEvaluation
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
-from caustic_cli.studies.manufacture import preview
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace
+
+waves, manufacture = OnDemand("caustic_cli.inverse.waves"), OnDemand("caustic_cli.studies.manufacture")
 
 DEFAULT_SPANS = 128  # knot spans of the final net; divisible by 2 through the stages
 NETWORK_CONTROL = 50  # table D.2
@@ -265,7 +266,7 @@ class OneSurface(Problem):
             return found
         return super().objective_in(scene, k, begun)
 
-    def on_waves(self, scene: Scene, k: int, begun: Tensor) -> WaveObjective:
+    def on_waves(self, scene: Scene, k: int, begun: Tensor) -> LossOfHeights:
         """The objective of stage k on the wave image.
 
         Raises:
@@ -273,7 +274,7 @@ class OneSurface(Problem):
         """
         stage, o = self.stages[k], self.options
         try:
-            return WaveObjective(
+            return waves.WaveObjective(
                 scene,
                 self.field(k),
                 begun,
@@ -381,7 +382,7 @@ class OneSurface(Problem):
 
     def preview(self, heights: Tensor, size: int) -> Iterator[str]:
         """What is to be said of an initial surface; size: expected bytes of its file."""
-        yield preview(self.scene, self.field(0), heights, size)
+        yield manufacture.preview(self.scene, self.field(0), heights, size)
 
     def advice(self, size: tuple[float, float]) -> str:
         """A recommendation after the design, or "".
@@ -423,7 +424,7 @@ class OneSurface(Problem):
             size: width and height of the picture, mm; timed: under a time limit, do not increase the number of rays, and limit the
                 iterations for the least error.
         """
-        found = Evaluator(designer, state, self.final_rays, size, timed)
+        found = LensEvaluation(designer, state, self.final_rays, size, timed)
         if self.one_scene:
             found.compare_with_start()
         found.compare_unrounded()

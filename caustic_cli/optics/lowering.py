@@ -10,6 +10,7 @@ from typing import TypeGuard
 
 from caustic_cli.optics.backends import Fused
 from caustic_cli.optics.frames import Pose
+from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import Element, PlacedScreen
 from caustic_cli.scene import Pupil, Screen
@@ -19,21 +20,20 @@ def lowered(tracer, before: Fused | None) -> Fused | None:
     """The rest of a tracer's system as one fused kernel; None where it does not apply.  before: that of the previous chunk, whose
     prepared arrays are reused."""
     system, start, (inside, outside) = tracer.system, tracer.start, tracer.media[-2:]
-    element, pupil = system.elements[-1], system.pupil
-    surface = element.surface
+    element = system.elements[-1]
     asked = tracer.requests.stages or tracer.actions or tracer.track or any(medium.varies for medium in tracer.media)
-    if asked or tracer.first != len(system.elements) - 1 or not _is_plain(element, pupil):
+    if asked or tracer.first != len(system.elements) - 1 or not _is_plain(element, system.pupil) or tracer.sides[-1] < 0:
         return None
-    if start.polarised is not None or not isinstance(start.origin[2], float) or not (system.lit or tracer.first):
+    if not _are_plain(start) or not (system.lit or tracer.first):
         return None
     eta = inside.index_at(start.wavelength) / outside.index_at(start.wavelength)
     if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface
         return None
-    if tracer.sides[-1] < 0 or (start.along_axis and element.aperture != pupil.aperture):
+    if not start.along_axis:
+        return tracer.backend.ray_image(element.surface, start, eta, element.fresnel, element.aperture.radius, before)
+    if element.aperture != system.pupil.aperture:
         return None
-    if start.along_axis:
-        return tracer.backend.plane_image(surface, start, eta, element.fresnel, before)
-    return tracer.backend.ray_image(surface, start, eta, element.fresnel, element.aperture.radius, before)
+    return tracer.backend.plane_image(element.surface, start, eta, element.fresnel, before)
 
 
 def _is_plain(element: Element, pupil: Pupil) -> bool:
@@ -45,6 +45,11 @@ def _is_plain(element: Element, pupil: Pupil) -> bool:
         and element.pose == Pose()
         and element.aperture.half_size == surface.half_size == pupil.half_size
     )
+
+
+def _are_plain(rays: RayState) -> bool:
+    """Whether rays start in one plane, and their polarisation is not tracked."""
+    return rays.polarised is None and isinstance(rays.origin[2], float)
 
 
 def covers(screen: Screen | PlacedScreen) -> TypeGuard[Screen]:

@@ -33,21 +33,26 @@ def meet(tracer, m, heights: Tensor | None) -> None:
     o, d = to_local(element.pose, state.origin, state.direction, state.datum)
     if m.index == 0 and m.forward and prepared is None and system.lit is None and not element.surface.flat:
         o, state = _moved_before_surface(tracer, o, d, state, element, heights)
-    hit = next((h for a in tracer.actions if (h := a.intersect(m, o, d, heights)) is not None), None)
-    if hit is None:
-        hit = prepared(heights) if prepared else element.surface.intersect(heights, o, d, m.side)
+    hit = _intersection(tracer, m, o, d, heights, prepared)
     if state.power.dtype != tracer.dtype:  # the first intersection is always computed in float64
         t, gx, gy = (_cast(c, tracer.dtype) for c in hit[:3])
         state, hit = state.to(tracer.dtype), SurfaceIntersection(t, gx, gy, hit.found)
         o, d = (tuple(_cast(c, tracer.dtype) for c in v) for v in (o, d))
     m.hit = Hit(advance(o, d, hit.t), d, (hit.gx, hit.gy), hit.t)
-    if (
-        prepared is None or state.sample is None or not _is_pupil(element, system)
-    ):  # a sample of the same aperture lies on the surface
+    on_surface = prepared is not None and state.sample is not None and _is_pupil(element, system)  # points of the same aperture
+    if not on_surface:
         tracer.keep(state, _passed(element, m.hit, hit.found))
     state.origin = to_global(element.pose, m.hit.local, state.datum)
     state.path = state.path + m.n_in * hit.t
     m.state = state
+
+
+def _intersection(tracer, m, o, d, heights: Tensor | None, prepared) -> SurfaceIntersection:
+    """Intersections of rays in the element's frame with its surface: of an effect that replaces it, prepared, or of the surface."""
+    for action in tracer.actions:
+        if (hit := action.intersect(m, o, d, heights)) is not None:
+            return hit
+    return prepared(heights) if prepared else m.element.surface.intersect(heights, o, d, m.side)
 
 
 def _at_pupil(system, m) -> bool:

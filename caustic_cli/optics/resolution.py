@@ -15,7 +15,7 @@ from torch import Tensor
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.scene import Lens, Scene
-from caustic_cli.scene.features import ELEMENTS, FREE_ENTRANCE, features_of
+from caustic_cli.scene.traits import Capability
 
 #: Wavelength, nm, that represents light of unspecified wavelength, and the band of white light.
 GREEN, BAND = 550.0, (450.0, 650.0)
@@ -145,6 +145,12 @@ class Paraxial:
     straight: float
 
 
+PARAXIAL = Capability(
+    "paraxial estimates by the exit",
+    dict.fromkeys(("two sides", "other elements"), "the exit alone does not determine where light lands"),
+)
+
+
 def _seen_from(lens: Lens) -> float:
     """z, mm, from which the apparent distance of a source at the exit is measured: glass appears thinner by the factor n."""
     return lens.z_in + (lens.offset.thickness - lens.z_in) / lens.inside
@@ -154,7 +160,7 @@ def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial | No
     """Paraxial data of a scene's lens with heights (n, m) mm at POINTS^2 points, for light from the source's centre; None if its
     exit alone does not determine where light lands."""
     lens = scene.lens
-    if features_of(scene, (FREE_ENTRANCE, ELEMENTS)):
+    if not PARAXIAL.supports(scene):
         return None
     distance = abs(scene.screen.z - lens.offset.thickness)
     vergence = 0.0 if scene.source.distant else 1.0 / (_seen_from(lens) - scene.source.centre[2])

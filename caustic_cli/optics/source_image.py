@@ -21,6 +21,17 @@ import numpy as np
 from caustic_cli.optics.screen_shape import normals, points_in_space
 from caustic_cli.optics.spread import Spread
 from caustic_cli.scene import Scene
+from caustic_cli.scene.traits import Capability
+
+SOURCE_IMAGES = Capability(
+    "images of an extended source",
+    dict.fromkeys(("separate places", "several sources"), "its places have images of their own")
+    | {"ray file": "its rays have no common image"}
+    | dict.fromkeys(
+        ("other elements", "folded axis", "designed entrance", "gradient index"),
+        "one refraction behind a flat entrance does not give the image",
+    ),
+)
 
 #: Positions along each axis of the lens and of the screen, in half widths.
 LENS, SCREEN, MIDDLE = np.linspace(-1.0, 1.0, 3), np.linspace(-1.0, 1.0, 5), np.zeros(1)
@@ -38,10 +49,8 @@ def source_images(scene: Scene, middle: bool = False) -> list[Spread]:
     Empty without an extended source, where its positions lie at several depths or its light is that of several sources, for a ray
     file, with other elements, a free-form entrance or a gradient index.
     """
-    source, lens = scene.source, scene.lens
-    if not source.extended or source.apart or source.rays is not None or len(source.members) > 1:
-        return []
-    if scene.elements or lens.entrance is not None or lens.gradient is not None:
+    source = scene.source
+    if not (source.extended and SOURCE_IMAGES.supports(scene)):
         return []
     if not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0:
         return []

@@ -47,7 +47,7 @@ from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, Element, PlacedScreen, System
-from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Scene, Screen
 
 #: Rays per chunk, which bounds the memory.
 CHUNK = 1 << 19
@@ -295,24 +295,6 @@ def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUEST
     """Whether a scene is traced by a fused kernel."""
     few = next(iter(rays_of(scene, "grid", 4).chunks()))
     return covers(scene.screen) and Tracer(System.of(scene, field), few, requests=requests).fused is not None
-
-
-def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = False) -> None:
-    """Trace a few rays of a scene, so that all kernels that it needs are compiled.
-
-    Net and image are small, and a plane wave or a point represents the source.  gradient: compile the adjoints, too.
-    """
-    lens = replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None, array=(1, 1))
-    source = PlaneWave() if scene.source.collimated else Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
-    scene, field = Scene(source, lens, scene.screen, Light(scene.light.polarisation)), HeightField.of(lens)
-    heights = torch.full((4, 4), lens.offset.thickness, dtype=torch.float64, requires_grad=gradient)
-    screen = replace(scene.screen, resolution=(4, 4))
-    with torch.set_grad_enabled(gradient):
-        for kind in ("lines", "stratified") if scene.source.collimated else ("stratified",):
-            traced = next(tracers(scene, field, rays_of(scene, kind, 16), torch.float64, 1 << 10, requests))
-            image = traced.expose({EXIT: heights}, screen, Filter("cosine", (3, 3)))
-            if gradient:
-                (image.image.sum() + image.leaving.sum()).backward()
 
 
 def trace(system: System, rays: Sample | RayState, parameters: Parameters, **options) -> list[RayState]:

@@ -18,14 +18,14 @@ from caustic_cli.config.settings import Given, Settings
 from caustic_cli.config.table import TABLE, Section, Setting
 from caustic_cli.io.arrays import open_npy
 from caustic_cli.io.files import read_bytes
-from caustic_cli.io.intensities import MOST_BYTES, parse_distribution
-from caustic_cli.io.intensities import TABLE as OF_INTENSITIES
 from caustic_cli.io.picture import read_picture
-from caustic_cli.io.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays
-from caustic_cli.io.sags import read_sags
+from caustic_cli.loading import OnDemand
 from caustic_cli.scene.gradient import MOST_VALUES, checked_volume
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.section import Attached
+
+intensities, sags = OnDemand("caustic_cli.io.intensities"), OnDemand("caustic_cli.io.sags")
+rayfiles = OnDemand("caustic_cli.io.rayfiles")
 
 #: Settings that name a file.
 ROWS = [row for row in TABLE.values() if row.file]
@@ -107,22 +107,22 @@ def rays_of(name: str) -> RaySet:
     Raises:
         InputError: the file is missing, too large, or not a ray file.
     """
-    return parse_rays(read_bytes(Path(name), MAX_BYTES, ACCEPTED), name)
+    return rayfiles.parse_rays(read_bytes(Path(name), rayfiles.MAX_BYTES, rayfiles.ACCEPTED), name)
 
 
 def _light(path: Path, _given: Given) -> _Read:
     """A ray file, or the picture of a disc's brightness as irradiance."""
     suffix = path.suffix.lower()
-    if suffix in SUFFIXES:
-        data = read_bytes(path, MAX_BYTES, ACCEPTED)
-        return _Read(data, parse_rays(data, str(path)), suffix)
+    if suffix in rayfiles.SUFFIXES:
+        data = read_bytes(path, rayfiles.MAX_BYTES, rayfiles.ACCEPTED)
+        return _Read(data, rayfiles.parse_rays(data, str(path)), suffix)
     light = read_picture(path, linear=True).irradiance()
-    return _Read(read_bytes(path, MAX_BYTES, ACCEPTED), light, suffix)
+    return _Read(read_bytes(path, rayfiles.MAX_BYTES, rayfiles.ACCEPTED), light, suffix)
 
 
 def _intensity(path: Path, _given: Given) -> _Read:
-    data = read_bytes(path, MOST_BYTES, OF_INTENSITIES)
-    return _Read(data, parse_distribution(data, str(path)), path.suffix.lower())
+    data = read_bytes(path, intensities.MOST_BYTES, intensities.TABLE)
+    return _Read(data, intensities.parse_distribution(data, str(path)), path.suffix.lower())
 
 
 def _profile(path: Path, _given: Given) -> _Read:
@@ -146,7 +146,7 @@ def _index(path: Path, _given: Given) -> _Read:
 
 
 def _sags(path: Path, _given: Given) -> _Read:
-    data, heights = read_sags(path)
+    data, heights = sags.read_sags(path)
     return _Read(data, heights, path.suffix.lower())
 
 

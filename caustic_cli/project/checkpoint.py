@@ -207,60 +207,73 @@ def load(path: Path) -> Checkpoint:
         InputError: it is missing, no regular file, larger than MAX_BYTES, damaged, or of a newer version.
     """
     with open_regular(path, NEEDED, MAX_BYTES) as file:
-        return _load(path, file)
-
-
-def _load(path: Path, file: BinaryIO) -> Checkpoint:
-    if not _sealed(file):
-        at_once, later = _begins(file)
-        version = _version(path) if at_once or later else 0
-        if version > FORMAT_VERSION:
-            raise _Newer(path, version)
-        if version == 0 or not at_once:
+        _refuse_unsealed(path, file)
+        try:
+            with h5py.File(file, "r") as f:
+                if (version := int(f.attrs["format_version"])) > FORMAT_VERSION:
+                    raise _Newer(path, version)
+                checkpoint = _read(f)
+        except _Newer:
+            raise
+        except Exception as error:  # a damaged file may cause any exception in h5py
             raise InputError(
-                f"{path}: is damaged (its checksum does not match its content) or not a caustic checkpoint; an intact"
-                " checkpoints.h5 is needed"
-            )
-    try:
-        with h5py.File(file, "r") as f:
-            version = int(f.attrs["format_version"])
-            if version > FORMAT_VERSION:
-                raise _Newer(path, version)
-            if f.visititems_links(lambda name, link: None if isinstance(link, h5py.HardLink) else name):
-                raise ValueError("link")
-            contents = _Contents(f)
-            rows = contents.read("history")
-            if rows.ndim != 2 or rows.shape[1] != len(HISTORY) or len(rows) > MOST_ITERATIONS:
-                raise ValueError("history")
-            group = f["state"]
-            heights = contents.net(HEIGHTS)
-            state = State(
-                heights,
-                **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
-                **{name: {k: contents.tensor(f"state/{name}/{k}") for k in group[name]} for name in ("parameters", "optimizer")},
-                history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
-                seconds=float(group.attrs["seconds"]),
-                reason=str(group.attrs["reason"]),
-                **{name: contents.net(name, heights) for name in STARTS if name in f},
-            )
-            if min(state.stage, state.iteration, state.total) < 0 or not 0 <= state.seconds < math.inf:
-                raise ValueError("state")
-            spaces = tuple(
-                SplineSpace(int(p), contents.tensor(f"lens/knots_{axis}"))
-                for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True)
-            )
-            texts = f.attrs["provenance"], f.attrs["results"], f.attrs.get("inputs", "{}")
-            tables = [json.loads(text) for text in texts]
-            if not all(isinstance(table, dict) for table in tables):
-                raise ValueError("tables")
-            checkpoint = Checkpoint(state, spaces, *tables)
-    except _Newer:
-        raise
-    except Exception as error:  # a damaged file may cause any exception in h5py
-        raise InputError(f"{path}: is damaged or not a caustic checkpoint ({error}); an intact checkpoints.h5 is needed") from error
-    nets = [z for z in (state.heights, state.start, state.unrounded) if z is not None]
-    fits = tuple(state.heights.shape[-2:]) == (spaces[0].n, spaces[1].n)
-    fits &= state.unrounded is None or (state.start is not None and state.start.shape == state.unrounded.shape)
-    if not fits or not all(bool(torch.isfinite(z).all()) for z in nets):
+                f"{path}: is damaged or not a caustic checkpoint ({error}); an intact checkpoints.h5 is needed"
+            ) from error
+    if not _is_consistent(checkpoint):
         raise InputError(f"{path}: is damaged (its heights do not match its knots); an intact checkpoints.h5 is needed")
     return checkpoint
+
+
+def _refuse_unsealed(path: Path, file: BinaryIO) -> None:
+    """Refuse a file whose checksum does not match, unless it is of a version without one; errors as of `load`."""
+    if _sealed(file):
+        return
+    at_once, later = _begins(file)
+    version = _version(path) if at_once or later else 0
+    if version > FORMAT_VERSION:
+        raise _Newer(path, version)
+    if version == 0 or not at_once:
+        raise InputError(
+            f"{path}: is damaged (its checksum does not match its content) or not a caustic checkpoint; an intact"
+            " checkpoints.h5 is needed"
+        )
+
+
+def _read(f: h5py.File) -> Checkpoint:
+    """The contents of a file of a known version; any exception is raised if it is damaged."""
+    if f.visititems_links(lambda name, link: None if isinstance(link, h5py.HardLink) else name):
+        raise ValueError("link")
+    contents = _Contents(f)
+    rows = contents.read("history")
+    if rows.ndim != 2 or rows.shape[1] != len(HISTORY) or len(rows) > MOST_ITERATIONS:
+        raise ValueError("history")
+    group = f["state"]
+    heights = contents.net(HEIGHTS)
+    state = State(
+        heights,
+        **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
+        **{name: {k: contents.tensor(f"state/{name}/{k}") for k in group[name]} for name in ("parameters", "optimizer")},
+        history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
+        seconds=float(group.attrs["seconds"]),
+        reason=str(group.attrs["reason"]),
+        **{name: contents.net(name, heights) for name in STARTS if name in f},
+    )
+    if min(state.stage, state.iteration, state.total) < 0 or not 0 <= state.seconds < math.inf:
+        raise ValueError("state")
+    u, v = (
+        SplineSpace(int(p), contents.tensor(f"lens/knots_{axis}")) for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True)
+    )
+    texts = f.attrs["provenance"], f.attrs["results"], f.attrs.get("inputs", "{}")
+    tables = [json.loads(text) for text in texts]
+    if not all(isinstance(table, dict) for table in tables):
+        raise ValueError("tables")
+    return Checkpoint(state, (u, v), *tables)
+
+
+def _is_consistent(checkpoint: Checkpoint) -> bool:
+    """Whether the heights are finite and match the knots and each other."""
+    state, (u, v) = checkpoint.state, checkpoint.spaces
+    nets = [z for z in (state.heights, state.start, state.unrounded) if z is not None]
+    fits = tuple(state.heights.shape[-2:]) == (u.n, v.n)
+    fits &= state.unrounded is None or (state.start is not None and state.start.shape == state.unrounded.shape)
+    return fits and all(bool(torch.isfinite(z).all()) for z in nets)

@@ -84,7 +84,7 @@ class Project:
 
     path: None for a project in memory; on_disk: whether its settings were read from
     there; asked: digest of the user's input (`uptodate`); found: the checkpoint of an earlier design with the same input; hold:
-    context that releases the lock of the directory; without_waves: see `config.completion.without_waves`; values: of the scene
+    context that releases the lock of the directory; without_waves: see `config.wave_stages.without_waves`; values: of the scene
     parameters of a network, None for the middle of their ranges.
     """
 

@@ -3,20 +3,31 @@ here."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+from functools import cached_property, reduce
+from typing import TYPE_CHECKING, Any
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene import sources
 from caustic_cli.scene.aperture import Aperture, CircularAperture, Pupil
 from caustic_cli.scene.elements import (
+    BESIDE_ELEMENTS,
+    BESIDE_LENSES,
     COMPONENTS,
     Component,
     FoldMirror,
-    check_compatible_with_elements,
     check_positions,
     surface_name,
 )
 from caustic_cli.scene.freeform import FreeForm, SecondTarget
 from caustic_cli.scene.lens import Lens, Offset
 from caustic_cli.scene.light import Light
+from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import Screen
-from caustic_cli.scene.sources import Disc, PlaneWave, Points, Source
+from caustic_cli.scene.sources import PlaneWave, Source
+
+if TYPE_CHECKING:
+    from caustic_cli.scene.sources import Disc, Points
 
 __all__ = [
     "COMPONENTS",
@@ -38,12 +49,6 @@ __all__ = [
     "SecondTarget",
     "Source",
 ]
-
-from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
-
-from caustic_cli.errors import InputError
-from caustic_cli.scene.materials import refractive_index
 
 
 @dataclass(frozen=True)
@@ -97,15 +102,16 @@ class Scene:
                     refractive_index(glass, wavelength)
 
     def _check_elements(self) -> None:
-        if not self.elements:
-            return
-        lens = self.lens
-        second = "second.file" if self.second is None else self.second.setting
-        wrong = {"lens.mirror": lens.mirror, "lens.gradient": lens.gradient is not None, "lens.array": lens.arrayed}
-        check_compatible_with_elements(wrong | {second: self.two_sided})
-        check_positions(self.elements, (lens.z_in, lens.offset.thickness), self.source.nearest, self.screen.z)
-        if self.source.rays is not None and self.unfolded.elements:
-            check_compatible_with_elements({"source.type": "rays"})
+        if self.elements:
+            BESIDE_ELEMENTS.refuse(self)
+            check_positions(self.elements, (self.lens.z_in, self.lens.offset.thickness), self.source.nearest, self.screen.z)
+            if self.unfolded is self:
+                BESIDE_LENSES.refuse(self)
+
+    @property
+    def second_setting(self) -> str:
+        """Path of the setting by which a lens has two free-form sides."""
+        return "second.file" if self.second is None else self.second.setting
 
     @property
     def before(self) -> tuple[Component, ...]:
@@ -122,7 +128,7 @@ class Scene:
         """The equivalent scene with a straight axis and without other elements, its screen as seen in the mirrors, if the other
         elements only fold the axis; itself otherwise."""
         mirrors = [e for e in self.elements if isinstance(e, FoldMirror) and e.flat]
-        if len(mirrors) < len(self.elements):
+        if not mirrors or len(mirrors) < len(self.elements):
             return self
         return replace(self, elements=(), screen=reduce(lambda screen, mirror: mirror.shows(screen), mirrors, self.screen))
 
@@ -219,3 +225,8 @@ class Scene:
             scene = self.at(wavelength) if self.dispersive else self
             bands += [Band(replace(scene, light=Light(state)), part / len(states), channel) for state in states]
         return tuple(bands)
+
+
+def __getattr__(name: str) -> Any:
+    """The other sources, which are loaded when they are asked for."""
+    return getattr(sources, name)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -24,6 +24,7 @@ from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.interaction import Reflecting, Refracting
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import Screen, Window, tilted
+from caustic_cli.scene.traits import Capability
 
 #: Largest semi-aperture of a sphere, as a fraction of its radius: beyond it light arrives near grazing incidence.
 STEEPEST = 0.95
@@ -263,15 +264,12 @@ def check_positions(elements: Sequence[Component], lens: tuple[float, float], so
         )
 
 
-def check_compatible_with_elements(wrong: Mapping[str, object], free: bool = False) -> None:
-    """Refuse settings that do not support other elements, or `free` ones: their paths and values, true or false for those that are
-    set or not.
-
-    Raises:
-        InputError: naming the setting and its value.
-    """
-    name, others = ("⟨element.free⟩", "free surfaces") if free else ("⟨element⟩", "lenses and mirrors")
-    for path, value in wrong.items():
-        if value:
-            said = f"⟨{path}⟩" if value is True else f"⟨{path}⟩ {value}"
-            raise InputError(f"{said} cannot be combined with {name}: it is not implemented beside other {others}")
+NOT_BESIDE = " cannot be combined with ⟨element⟩: it is not implemented beside other lenses and mirrors"
+BESIDE_ELEMENTS = Capability(
+    "other elements",
+    {
+        **dict.fromkeys(("mirror", "gradient index", "lenslet array"), "⟨{setting}⟩" + NOT_BESIDE),
+        "two sides": "⟨{scene.second_setting}⟩" + NOT_BESIDE,
+    },
+)
+BESIDE_LENSES = Capability("other lenses and curved mirrors", {"ray file": "⟨source.type⟩ rays" + NOT_BESIDE})

@@ -1,73 +1,135 @@
 """What a scene may have beyond the simplest one, and what each capability of this program does not support of it.
 
-The simplest scene is a clear lens of one refractive index with a flat entrance, unpolarised light of one wavelength from one
-source, and a plane screen, upright and centred on the axis.  Whatever does not support every trait (an export format, the
-interactive page, a study) says so in one `Capability`, from which its refusals and the matrix in the documents are made.
+The simplest scene is a clear rectangular lens of one refractive index with a flat entrance in an unpolarised plane wave of one
+wavelength, and a plane screen, upright and centred on the axis.  Whatever does not support every trait (an
+export format, the interactive page, a study) says so in one `Capability`, from which its refusals and the matrix in the documents
+are made.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from caustic_cli.errors import InputError
-from caustic_cli.scene import Scene
+
+if TYPE_CHECKING:
+    from caustic_cli.scene import Scene
+
+#: Types of sources that other programs are known to have, or files of rays.
+KNOWN_SOURCES = ("plane", "point", "grid", "disc", "rays", "several")
+
+
+def _disc(scene: Scene) -> bool:
+    return scene.source.kind == "disc"
+
+
+def _points(scene: Scene) -> bool:
+    return scene.source.kind in ("point", "grid")
 
 
 @dataclass(frozen=True)
 class Trait:
-    """Something that a scene may have: a noun phrase for messages, and whether a scene has it."""
+    """Something that a scene may have."""
 
+    #: Noun phrase for messages.
     words: str
+    #: Whether a scene has it.
     found_in: Callable[[Scene], bool]
+    #: The settings by which a scene gets it: paths, each with a value where only that value counts; or element.
+    settings: tuple[str, ...] = ()
 
 
 #: All traits by name, in the order in which messages list them.
 TRAITS: Mapping[str, Trait] = {
-    "mirror": Trait("a mirror", lambda s: s.lens.mirror),
-    "gradient index": Trait("an index that varies", lambda s: s.lens.gradient is not None),
-    "two sides": Trait("a free-form entrance", lambda s: s.two_sided),
-    "other elements": Trait("other elements beside it", lambda s: bool(s.unfolded.elements)),
-    "lenslet array": Trait("lenslets", lambda s: s.lens.arrayed),
-    "circular aperture": Trait("a circular aperture", lambda s: s.lens.opening.round),
-    "absorption": Trait("absorption", lambda s: s.lens.absorption > 0 or any(e.absorption > 0 for e in s.elements)),
-    "roughness": Trait("roughness", lambda s: s.lens.roughness > 0),
-    "polarisation": Trait("polarised light", lambda s: s.light.polarisation is not None),
-    "several wavelengths": Trait("several wavelengths", lambda s: len(s.light.wavelengths) > 1),
-    "tilted screen": Trait("a tilted screen", lambda s: any(s.screen.tilt)),
-    "shifted screen": Trait("a shifted screen", lambda s: any(s.screen.shift)),
-    "curved screen": Trait("a curved screen", lambda s: s.screen.curved),
-    "several sources": Trait("several sources", lambda s: len(s.source.members) > 1),
-    "ray file": Trait("the rays of a file", lambda s: any(one.rays is not None for one in s.source.members)),
+    "mirror": Trait("a mirror", lambda s: s.lens.mirror, ("lens.mirror",)),
+    "gradient index": Trait("an index that varies", lambda s: s.lens.gradient is not None, ("lens.gradient",)),
+    "two sides": Trait("a free-form entrance", lambda s: s.two_sided, ("second.file", "second.collimate", "second.focus")),
+    "designed entrance": Trait("a designed free-form entrance", lambda s: s.lens.entrance is not None),
+    "other elements": Trait("other elements beside it", lambda s: bool(s.unfolded.elements), ("element.reshapes",)),
+    "folded axis": Trait("an axis folded by flat mirrors", lambda s: s.unfolded is not s),
+    "lenslet array": Trait("lenslets", lambda s: s.lens.arrayed, ("lens.array",)),
+    "circular aperture": Trait("a circular aperture", lambda s: s.lens.opening.round, ("lens.aperture circle",)),
+    "absorption": Trait(
+        "absorption", lambda s: s.lens.absorption > 0 or any(e.absorption > 0 for e in s.elements), ("lens.absorption",)
+    ),
+    "roughness": Trait("roughness", lambda s: s.lens.roughness > 0, ("lens.roughness",)),
+    "approximate Fresnel": Trait("approximate Fresnel", lambda s: s.lens.fresnel != "exact", ("lens.fresnel",)),
+    "polarisation": Trait("polarised light", lambda s: s.light.polarisation is not None, ("source.polarisation",)),
+    "several wavelengths": Trait("several wavelengths", lambda s: len(s.light.wavelengths) > 1, ("source.wavelengths",)),
+    "coloured picture": Trait("a coloured picture", lambda s: s.colored, ("target.color",)),
+    "lumens": Trait("power in lumens", lambda s: s.light.unit != "W", ("source.power_unit",)),
+    "tilted screen": Trait("a tilted screen", lambda s: any(s.screen.tilt), ("screen.tilt",)),
+    "shifted screen": Trait("a shifted screen", lambda s: any(s.screen.shift), ("screen.shift",)),
+    "curved screen": Trait("a curved screen", lambda s: s.screen.curved, ("screen.radius", "screen.shape_file")),
+    "several sources": Trait("several sources", lambda s: len(s.source.members) > 1, ("source.also",)),
+    "ray file": Trait("the rays of a file", lambda s: s.source.rays is not None, ("source.type rays",)),
+    "ray file among sources": Trait(
+        "the rays of a file among several sources",
+        lambda s: len(s.source.members) > 1 and any(one.rays is not None for one in s.source.members),
+    ),
+    "user-defined source": Trait("a user-defined type of source", lambda s: s.source.kind not in KNOWN_SOURCES),
+    "near source": Trait("a source nearby", lambda s: not s.source.distant, ("source.position",)),
+    "light not parallel": Trait("light that is not parallel", lambda s: not s.source.collimated),
+    "separate places": Trait("sources in separate places", lambda s: s.source.apart),
+    "uneven plane wave": Trait("a profile of its irradiance", lambda s: s.source.profile is not None, ("source.profile",)),
+    "uneven source": Trait("a picture of its radiance", lambda s: s.source.brightness is not None),
+    "tabulated intensity": Trait("a table of its intensity", lambda s: not isinstance(s.source.intensity, str)),
+    "uneven points": Trait("points of another than uniform intensity", lambda s: _points(s) and s.source.intensity != "uniform"),
+    "disc at infinity": Trait("a disc at infinity", lambda s: _disc(s) and s.source.distant, ("source.angle",)),
+    "disc not Lambertian": Trait("a disc that is not Lambertian", lambda s: _disc(s) and s.source.intensity != "lambertian"),
+    "disc in a cone": Trait("a disc with a cone", lambda s: _disc(s) and s.source.cone is not None, ("source.cone",)),
+    "elliptical disc": Trait("an elliptical disc", lambda s: s.source.extent[0] != s.source.extent[1]),
+    "line source": Trait("a disc without area", lambda s: _disc(s) and min(s.source.frame) == 0),
 }
-
-
-def traits_of(scene: Scene) -> Iterator[str]:
-    """Names of the traits that a scene has, in their order."""
-    return (name for name, trait in TRAITS.items() if trait.found_in(scene))
 
 
 @dataclass(frozen=True)
 class Capability:
-    """Something this program does with a scene: name, as the documents say it, and for each trait that it does not support the
-    message of its refusal, in which {} stands for all traits of the scene that have the same message."""
+    """Something that this program does with a scene."""
 
+    #: As the documents call it.
     name: str
+    #: Message of its refusal for each trait that it does not support, in the order in which they are looked for; {} stands for the
+    #: words of all traits of the scene with the same message, {setting} for the setting of the trait, {scene} for the scene.
     unsupported: Mapping[str, str]
 
-    def why_not(self, scene: Scene) -> str:
-        """Why a scene is not supported; "" if it is."""
-        there = [name for name in self.unsupported if TRAITS[name].found_in(scene)]
-        if not there:
-            return ""
-        message = self.unsupported[there[0]]
-        return message.format(", ".join(TRAITS[name].words for name in there if self.unsupported[name] == message))
+    def obstacle(self, scene: Scene) -> str:
+        """The first trait of a scene that is not supported, "" if there is none."""
+        return next((name for name in self.unsupported if TRAITS[name].found_in(scene)), "")
 
-    def refuse(self, scene: Scene) -> None:
-        """Refuse a scene before work begins.
+    def supports(self, scene: Scene) -> bool:
+        """Whether a scene is supported."""
+        return not self.obstacle(scene)
+
+    def why_not(self, scene: Scene, **words: str) -> str:
+        """Why a scene is not supported, "" if it is; words: further ones of the message."""
+        if not (first := self.obstacle(scene)):
+            return ""
+        message = self.unsupported[first]
+        alike = [TRAITS[name].words for name, m in self.unsupported.items() if m == message and TRAITS[name].found_in(scene)]
+        return message.format(", ".join(alike), setting=next(iter(TRAITS[first].settings), ""), scene=scene, **words)
+
+    def refuse(self, scene: Scene, **words: str) -> None:
+        """Refuse a scene before work begins; arguments as of `why_not`.
 
         Raises:
             InputError: the scene has a trait that is not supported.
         """
-        if why := self.why_not(scene):
+        if why := self.why_not(scene, **words):
             raise InputError(why)
+
+
+#: What other ray tracers do not represent of a single lens: those of its traits beside its surfaces and its source.
+BEYOND_CLEAR = (
+    "mirror",
+    "gradient index",
+    "absorption",
+    "roughness",
+    "polarisation",
+    "several wavelengths",
+    "tilted screen",
+    "shifted screen",
+    "curved screen",
+)

@@ -22,19 +22,22 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.errors import InputError
 from caustic_cli.optics.resolution import GREEN, Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Scene
-from caustic_cli.scene.features import FREE_ENTRANCE, GRADIENT, features_of
+from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.measurement import Reference
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study, plain_ticks
 from caustic_cli.studies.retrace import sampler_for
 
+DIFFRACTION = Capability(
+    "study of diffraction",
+    dict.fromkeys(("gradient index", "two sides"), "⟨study⟩ diffraction is of lenses of one index with a flat entrance"),
+)
 #: Lens widths, mm; wavelengths, nm; full angles of a distant source, degrees.
 SIZES = (5.0, 10.0, 20.0, 40.0, 60.0, 100.0)
 WAVELENGTHS = (405.0, 550.0, 780.0, 1064.0, 1550.0)
@@ -91,8 +94,7 @@ def run_diffraction(
     Raises:
         InputError: the index varies, or the entrance is free-form.
     """
-    if features_of(scene, (GRADIENT, FREE_ENTRANCE)):
-        raise InputError("⟨study⟩ diffraction is of lenses of one index with a flat entrance")
+    DIFFRACTION.refuse(scene)
     plane = replace(scene, source=PlaneWave(scene.source.power), light=Light())
     own = plane.lens.size[0]
     cases = _cases(own)

@@ -34,6 +34,12 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene.traits import Capability
+
+DERIVATIVE = Capability(
+    "gradmap",
+    {"gradient index": "the image's derivative by one height is taken of lenses of one index, and this one's varies"},
+)
 
 #: Least margin, pixels, around the non-zero part that a plot shows.
 LEAST_BESIDE = 3.0
@@ -69,8 +75,7 @@ def gradient_image(
         InputError: no such control point, a filter without a derivative, or a gradient index, for which only the reverse mode is
             implemented.
     """
-    if scene.lens.gradient is not None:
-        raise InputError("the image's derivative by one height is taken of lenses of one index, and this one's varies")
+    DERIVATIVE.refuse(scene)
     direction = _direction(field, control).to(sampler.device)
     if min(filter.reach) < 1:
         raise InputError(

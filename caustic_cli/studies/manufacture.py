@@ -27,6 +27,7 @@ from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Aperture, Scene
 from caustic_cli.scene.materials import material
+from caustic_cli.scene.traits import Capability
 
 #: Most sample points along each axis and per knot span.
 MOST, A_SPAN = 2001, 4
@@ -112,9 +113,15 @@ def _within(aperture: Aperture, z: Tensor) -> Tensor:
     return aperture.covers(u[:, None], v[None, :])
 
 
+WALL = Capability(
+    "wall and stock of a design",
+    {"mirror": "a mirror has no glass", "two sides": "heights are measured from a flat entrance"},
+)
+
+
 def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[str, float]:
     """Least and largest height above the flat entrance, mm, as of `manufacture`; nothing of a mirror or a free-form entrance."""
-    if scene.lens.mirror or scene.two_sided:
+    if not WALL.supports(scene):
         return {}
     (z,) = sampled(field, heights, [_points(s) for s in field.spaces], ((0, 0),))
     z = z[_within(scene.lens.opening, z)]
@@ -141,13 +148,22 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -
     )
 
 
+THROW = Capability(
+    "advice on the throw of a thinner plate",
+    {
+        "near source": "the relief collects the light of the source, whatever the throw",
+        "mirror": "its relief is not that of a sheet",
+        "other elements": "they decide the throw, too",
+    },
+)
+
+
 def _thinner(scene: Scene, low: float, high: float) -> str:
     """Advice on the throw at which a plate, whose surface lies between two heights, mm, is as thin as sheet material: relief ~ 1 /
-    throw for a distant source; near a source the relief collects its light, whatever the throw."""
+    throw."""
     sheet = SHEET * max(scene.lens.size)
     room = sheet - (low - scene.lens.z_in)  # not positive for a lens that is not a plate
-    near = math.isfinite(scene.source.nearest)
-    if near or scene.lens.mirror or scene.unfolded.elements or not 0.0 < room < high - low:
+    if not (THROW.supports(scene) and 0.0 < room < high - low):
         return ""
     middle = scene.lens.offset.thickness
     throw = float(f"{middle + (scene.screen.z - middle) * (high - low) / room:.2g}")

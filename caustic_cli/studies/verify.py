@@ -35,8 +35,8 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
-from caustic_cli.scene.features import special_features
-from caustic_cli.studies.independent_rays import KINDS, sample_rays
+from caustic_cli.scene.traits import BEYOND_CLEAR, Capability
+from caustic_cli.studies.independent_rays import sample_rays
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import BATCHES
 
@@ -51,19 +51,24 @@ NORMAL, CHI2, LARGEST = 0.0027, 0.05, 7.0
 LIGHT, LEAK = 4.0, 5e-5
 #: Tolerance for a better correlation of a flipped image, which for symmetric pictures differs by noise alone.
 TIE = 1e-2
+VERIFICATION = Capability(
+    "comparison with Mitsuba",
+    {
+        **dict.fromkeys(BEYOND_CLEAR, "⟨verify⟩ mitsuba traces clear lenses and straight screens, not {}"),
+        **dict.fromkeys(
+            ("ray file", "several sources", "user-defined source"),
+            "⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}",
+        ),
+        "approximate Fresnel": "⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}",
+    },
+)
 
 
-def unsupported(scene: Scene) -> str | None:
-    """Why a scene cannot be verified, None if it can: Mitsuba is not installed, or it does not trace such scenes."""
+def unsupported(scene: Scene) -> str:
+    """Why a scene cannot be verified, "" if it can: Mitsuba is not installed, or it does not trace such scenes."""
     if find_spec("mitsuba") is None:
         return "⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install mitsuba"
-    if special_features(scene):
-        return f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(special_features(scene))}"
-    if scene.source.kind not in KINDS:
-        return f"⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}"
-    if scene.lens.fresnel != "exact":
-        return f"⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}"
-    return None
+    return VERIFICATION.why_not(scene)
 
 
 @dataclass(frozen=True, eq=False)

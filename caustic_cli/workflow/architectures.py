@@ -18,9 +18,12 @@ from caustic_cli.inverse.problem import Options
 from caustic_cli.io.picture import Picture
 from caustic_cli.kinds import OneSurface, problem_of
 from caustic_cli.project.project import Project
+from caustic_cli.scene.traits import Capability
 from caustic_cli.workflow.comparison import picture_of_disc
 from caustic_cli.workflow.design import first_heights
 
+ONE_SIDE = "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
+NETWORKS = Capability("study of networks", dict.fromkeys(("two sides", "lenslet array"), ONE_SIDE))
 #: Grid of hyperparameters: hidden layers, neurons in each, activations, learning rates, and preconditioners of the output.
 LAYERS, WIDTHS, ACTIVATIONS, RATES = (1, 2, 3), (16, 64, 256), ("tanh", "silu"), (3e-4, 1e-3, 3e-3)
 OUTPUTS = ("none", "laplacian")
@@ -130,10 +133,9 @@ class _Study:
         if self.over is not None and chosen.start != "offset":
             _, self.problem, self.first = first_heights(project, {"lens": dict(project.settings.lens)}, self.problem)
         scene, stages, own = self.problem.scene, [s for s in self.problem.stages if not s.waves], self.problem.options
-        if not stages or scene.second is not None or scene.lens.arrayed:
-            raise InputError(
-                "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
-            )
+        if not stages:
+            raise InputError(ONE_SIDE)
+        NETWORKS.refuse(scene)
         last, control = stages[-1], scene.lens.control
         how = replace(last.rendering, blur=0.0)
         self.stage = replace(last, rendering=how, iterations=10**9, tolerance=0.0, source=None, spread=False, control=control)

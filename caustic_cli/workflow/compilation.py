@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +23,13 @@ from numba.core import event
 from caustic_cli.errors import is_out_of_memory
 from caustic_cli.optics.backends import backend_for, cuda_kernels
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
+from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.kernels import cache
-from caustic_cli.optics.trace import warm_up
-from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.trace import tracers
+from caustic_cli.scene import Lens, Light, PlaneWave, Points, Scene, Screen
 from caustic_cli.workflow.reporter import Reporter
 
 #: Seconds of compilation before the user is told.
@@ -180,3 +185,21 @@ def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Reque
 if __name__ == "__main__":
     for name in sys.argv[1:]:
         compile_part(name)
+
+
+def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = False) -> None:
+    """Trace a few rays of a scene, so that all kernels that it needs are compiled.
+
+    Net and image are small, and a plane wave or a point represents the source.  gradient: compile the adjoints, too.
+    """
+    lens = replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None, array=(1, 1))
+    source = PlaneWave() if scene.source.collimated else Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
+    scene, field = Scene(source, lens, scene.screen, Light(scene.light.polarisation)), HeightField.of(lens)
+    heights = torch.full((4, 4), lens.offset.thickness, dtype=torch.float64, requires_grad=gradient)
+    screen = replace(scene.screen, resolution=(4, 4))
+    with torch.set_grad_enabled(gradient):
+        for kind in ("lines", "stratified") if scene.source.collimated else ("stratified",):
+            traced = next(tracers(scene, field, rays_of(scene, kind, 16), torch.float64, 1 << 10, requests))
+            image = traced.expose({EXIT: heights}, screen, Filter("cosine", (3, 3)))
+            if gradient:
+                (image.image.sum() + image.leaving.sum()).backward()

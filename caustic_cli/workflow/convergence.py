@@ -5,13 +5,12 @@ What they are called and which options they take is known without torch: what a 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from caustic_cli.config import checks
-from caustic_cli.errors import InputError
 
 if TYPE_CHECKING:
     import torch
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from caustic_cli.optics.surfaces.heightfield import HeightField
     from caustic_cli.project.project import Project
     from caustic_cli.scene import Scene
+    from caustic_cli.scene.traits import Capability
     from caustic_cli.studies.report import Drawing, Study
     from caustic_cli.workflow.lens import Lens
     from caustic_cli.workflow.reporter import Reporter
@@ -60,6 +60,9 @@ class StudyRequest:
         return scene, field, heights.to(self.device)
 
 
+SINGLE = "⟨study⟩ {study} supports single lenses only, and this scene has [[element]] tables; studies of such scenes are {others}"
+
+
 class StudyKind:
     """A study."""
 
@@ -74,8 +77,8 @@ class StudyKind:
     rays_of_all: ClassVar[bool] = False
     #: Whether its errors are those of lenses against the picture, as of a design; others compare images with each other.
     of_lenses: ClassVar[bool] = False
-    #: Whether it supports all scenes.
-    any_scene: ClassVar[bool] = False
+    #: Messages for traits of scenes that it does not support, see `scene.traits`.
+    unsupported: Mapping[str, str] = {"other elements": SINGLE}
 
     @property
     def module(self) -> Any:
@@ -87,14 +90,12 @@ class StudyKind:
         """Endings of its plots' names, and what draws them; None for the usual one."""
         return getattr(self.module, "PLOTS", None)
 
-    def unsupported(self, lens: Lens) -> str | None:
-        """Why it does not support a lens, None if it does."""
-        if lens.scene.unfolded.elements and not self.any_scene:
-            return (
-                f"⟨study⟩ {self.name} supports single lenses only, and this scene has [[element]] tables; studies of such scenes"
-                f" are {', '.join(kind.name for kind in STUDIES.values() if kind.any_scene)}"
-            )
-        return None
+    @property
+    def capability(self) -> Capability:
+        """The scenes that it supports."""
+        from caustic_cli.scene.traits import Capability  # noqa: PLC0415
+
+        return Capability(f"study of {self.name}", self.unsupported)
 
     def measure(self, asked: StudyRequest) -> Study:
         """Run it.
@@ -104,10 +105,11 @@ class StudyKind:
         """
         from caustic_cli.workflow.compilation import compile_usual  # noqa: PLC0415
 
-        if asked.lens and (why := self.unsupported(asked.lens)):
-            raise InputError(why)
-        if asked.lens and not self.any_scene:
-            asked = replace(asked, lens=replace(asked.lens, scene=asked.lens.scene.unfolded))
+        if asked.lens:
+            others = ", ".join(kind.name for kind in STUDIES.values() if "other elements" not in kind.unsupported)
+            self.capability.refuse(asked.lens.scene, study=self.name, others=others)
+            if "other elements" in self.unsupported:
+                asked = replace(asked, lens=replace(asked.lens, scene=asked.lens.scene.unfolded))
         compile_usual(asked.device, asked.say)
         return self.run(asked)
 
@@ -130,7 +132,8 @@ class IntersectionStudy(StudyKind):
 class ImageStudy(StudyKind):
     """Settings of an image, see `studies.convergence`; by default of the initial sphere of a design."""
 
-    home, takes, rays_of_all, any_scene = "convergence", ("repeats", "dtype"), True, True
+    home, takes, rays_of_all = "convergence", ("repeats", "dtype"), True
+    unsupported: Mapping[str, str] = {}
 
     def __init__(self, name: str):
         self.name = name
@@ -187,6 +190,10 @@ class DiffractionStudy(StudyKind):
     """Rays against waves; by default of the lens of a bright disc."""
 
     name, home, unit, takes = "diffraction", "diffraction", "cases", ("dtype",)
+
+    @property
+    def unsupported(self) -> Mapping[str, str]:  # type: ignore[override]
+        return {**super().unsupported, **self.module.DIFFRACTION.unsupported}
 
     def run(self, asked: StudyRequest) -> Study:
         from caustic_cli.workflow.comparison import lens_of_disc  # noqa: PLC0415

@@ -32,10 +32,10 @@ from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture
-from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.kinds import OneSurface, kind_of, problem_of
 from caustic_cli.kinds.evaluation import Evaluated
 from caustic_cli.kinds.surface import PLATE, WALL
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate
@@ -44,11 +44,12 @@ from caustic_cli.project.new import new_project
 from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, Project, is_project
 from caustic_cli.scene import Scene
-from caustic_cli.studies.manufacture import wall_and_stock
 from caustic_cli.workflow.compilation import announce_compilation, compile_usual
 from caustic_cli.workflow.evaluation import evaluate_and_write, evaluation_seconds, expected_seconds
 from caustic_cli.workflow.movie import NoMovie
 from caustic_cli.workflow.reporter import Reporter
+
+surfaces, manufacture = OnDemand("caustic_cli.io.surfaces"), OnDemand("caustic_cli.studies.manufacture")
 
 #: Fraction of pixels brighter than NEARLY of the maximum above which a picture is taken for a drawing on white.
 GROUND, NEARLY = 0.6, 0.98
@@ -339,19 +340,19 @@ def _solved(project: Project, problem: OneSurface, fixed: bool) -> tuple[torch.T
         found = problem.transport(fixed, START_PART * project.settings.design.time_limit)
         return found.heights, found.middle
     net = problem.field(0)
-    if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
-        return onto(*read_surface(start, net.half_size), net), None
+    if Path(start).suffix.lower() in surfaces.SUFFIXES and not Path(start).is_dir():
+        return surfaces.onto(*surfaces.read_surface(start, net.half_size), net), None
     if not is_project(Path(start)):
         raise InputError(
             "⟨design.start⟩ must be transport, offset, a project directory or a lens surface"
-            f" ({', '.join(SUFFIXES)}), got {start!r}"
+            f" ({', '.join(surfaces.SUFFIXES)}), got {start!r}"
         )
     other = Project.open(start)
     _, field, heights, _ = other.lens(other.scene())
     sizes = [list(one.settings.lens.size) for one in (other, project)]
     if sizes[0] != sizes[1]:
         raise InputError(f"⟨design.start⟩: the lens of {start} is {sizes[0]} mm, not {sizes[1]} mm")
-    return onto(field, heights, net), None
+    return surfaces.onto(field, heights, net), None
 
 
 def _spare(lens: LensSettings, said: Given, first: torch.Tensor) -> float:
@@ -451,7 +452,7 @@ def _run(
             state.heights = rounded(designer.within_limits(state))
         with say.waiting("evaluation with independent rays", evaluation_seconds(designer, state)):
             found = evaluate_and_write(project, designer, state, timed)
-        made = wall_and_stock(problem.scene, designer.field(found.state.stage), designer.exit(found.state))
+        made = manufacture.wall_and_stock(problem.scene, designer.field(found.state.stage), designer.exit(found.state))
         result = _finished(project, designer, found, made, began, records)
         shown = found.image if found.waves is None else found.waves
         result = replace(result, figures=result.figures | movie.finish(shown, found.figures, say))

@@ -12,16 +12,17 @@ from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import discard
 from caustic_cli.io.picture import WIDE, write_image
 from caustic_cli.kinds.evaluation import Evaluated
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
-from caustic_cli.studies.design_report import write_report
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.retrace import evaluation_rays, retrace, white_level
-from caustic_cli.studies.waves import wave_figures
+
+design_report, by_waves = OnDemand("caustic_cli.studies.design_report"), OnDemand("caustic_cli.studies.waves")
 
 #: Points along each side of the aperture for the plot of the surface.
 REPORT_SAMPLES = 401
@@ -50,7 +51,7 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
         write_image(project.path / FARTHER, found.farther[0], white_level(*found.farther), encoding, WIDE)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
     surface = _surface(designer.field(found.state.stage), designer.exit(found.state))
-    write_report(
+    design_report.write_report(
         project.path / REPORT,
         grey(aim),
         grey(seen),
@@ -81,7 +82,7 @@ def expected_seconds(designer: Designer, state: State) -> float:
     seconds = retraces * PROBE * (time.monotonic() - began) + REPORT_SECONDS
     if any(s.waves for s in designer.stages):
         began = time.monotonic()
-        wave_figures(
+        by_waves.wave_figures(
             scene, field, state.heights.to(problem.device), target, Resolution.before(scene, scene.screen.size), required=False
         )
         seconds += WAVE_IMAGES * (time.monotonic() - began)

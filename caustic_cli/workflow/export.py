@@ -13,11 +13,12 @@ from types import ModuleType
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.errors import InputError, alternatives
-from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES, TWO_SIDED
+from caustic_cli.errors import alternatives
+from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.part import Part, part_of, turned
 from caustic_cli.export.reading import Reading, Readings
+from caustic_cli.export.supported import EXPORT, refuse
 from caustic_cli.io.heightmaps import beside
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.base import MeasuredSurface
@@ -79,8 +80,7 @@ class Exporter:
         best.  For light of a single wavelength, the refractive index in the file is that at this wavelength.
         """
         scene = at_own_wavelength(self.scene)
-        if why := unsupported(scene, format, script, mould):
-            raise InputError(why)
+        refuse(scene, format, script, mould)
         part = part_of(format, scene, self.field, self.heights, mould, block)
         home = _home(format)
         writer = getattr(home, f"write_{format}")
@@ -88,8 +88,6 @@ class Exporter:
             found = writer(path, part, Milling(**(milling or {})), **given)
             return {"milling": found | _scallops(scene, self.field, found)}
         scripts = import_module("caustic_cli.export.lighttools_script") if script else None
-        if scripts is not None:
-            scripts.refuse(scene)
         arguments = _arguments(format, part)
         file, judged = File(home, arguments, path if format == "heightmap" else None, part), hasattr(home, "readings")
         choice = given if not judged or {"samples", "tolerance"} & set(given) else self.smallest(file)
@@ -160,12 +158,9 @@ class Exporter:
 
     def _keeps(self, format: str) -> bool:
         """Whether the largest file of a format keeps the picture."""
-        try:
-            part = part_of(format, self.scene, self.field, self.heights)
-        except InputError:
+        if not EXPORT[format].supports(self.scene):
             return False
-        if self.scene.lens.entrance is not None and format not in TWO_SIDED:
-            return False
+        part = part_of(format, self.scene, self.field, self.heights)
         path = Path(f"lens{FORMATS[format][0]}")
         file = File(_home(format), _arguments(format, part), path if format == "heightmap" else None, part)
         return self.error(file, file.choices(MOST_BYTES)[-1], "error") <= self.picture.largest
@@ -174,18 +169,6 @@ class Exporter:
 def at_own_wavelength(scene: Scene) -> Scene:
     """A scene with the refractive index at its wavelength, if it has a single one."""
     return scene.at(scene.light.wavelengths[0]) if len(scene.light.wavelengths) == 1 else scene
-
-
-def unsupported(scene: Scene, format: str, script: bool, mould: bool) -> str | None:
-    """Why a format does not hold a scene, or not with a script or as a mould; None if it does."""
-    if scene.lens.entrance is not None and (script or mould or format not in TWO_SIDED):
-        return (
-            f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both,"
-            " without ⟨script⟩ or ⟨mould⟩"
-        )
-    if (script and scene.elements) or (format == "zemax" and scene.unfolded.elements):
-        return f"⟨format⟩ {format} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
-    return None
 
 
 @dataclass(frozen=True, eq=False)

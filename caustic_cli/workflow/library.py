@@ -90,14 +90,11 @@ def design(
     """
     by_name = {"mag": mag, "margin": margin, "throw": throw, "quality": quality, **given}
     by_name["rays"] = None if rays is None else count(rays)
-    sections: dict[str, Any] = dict(settings or {})
-    before = sections.get("source", {})
+    sections = dict(settings or {})
     if source is None or isinstance(source, str):
         by_name["source"] = source
-    elif isinstance(source, Mapping) and isinstance(before, Mapping):
-        sections["source"] = {**before, **source}
     else:
-        raise InputError("source must be a type or a section; several are given in settings, as a list of sections")
+        sections["source"] = _source_section(sections.get("source", {}), source)
     chosen = keywords.checked(keywords.from_keywords("design", by_name, signature(design).parameters), sections, "settings")
     return design_of(
         picture if isinstance(picture, str | Path) else _picture(picture),
@@ -109,6 +106,17 @@ def design(
         say=Listener(on_progress, on_message),
         device=device,
     )
+
+
+def _source_section(others: Any, source: Any) -> dict[str, Any]:
+    """The section of a source, which overrides the keys of another.
+
+    Raises:
+        InputError: they are not one section each.
+    """
+    if not (isinstance(source, Mapping) and isinstance(others, Mapping)):
+        raise InputError("source must be a type or a section; several are given in settings, as a list of sections")
+    return {**others, **source}
 
 
 def design_of(

@@ -15,13 +15,15 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from caustic_cli.inverse.designer import State
-from caustic_cli.io.movie import refuse_unwritable, write_movie
 from caustic_cli.io.picture import codes_of
+from caustic_cli.loading import OnDemand
 from caustic_cli.scene import Screen
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import white_level
 from caustic_cli.workflow.reporter import Reporter
+
+movies = OnDemand("caustic_cli.io.movie")
 
 #: Most frames; for a longer design every second, fourth, ... iteration is kept.
 MOST = 160
@@ -79,7 +81,7 @@ class Movie(NoMovie):
     frames: list[Frame] = field(default_factory=list)
 
     def __post_init__(self):
-        refuse_unwritable(self.path, self.force)
+        movies.refuse_unwritable(self.path, self.force)
         self._every, self._seen = 1, 0
         self._target: np.ndarray | None = None
         self._encoding = "srgb"
@@ -116,7 +118,7 @@ class Movie(NoMovie):
         if self.frames:
             each = min(max(LENGTH // len(self.frames), LEAST), LONGEST)
             shown = [_drawn(frame) for frame in self.frames]
-            write_movie(self.path, shown, [*[each] * (len(shown) - 1), LAST])
+            movies.write_movie(self.path, shown, [*[each] * (len(shown) - 1), LAST])
 
     def _error(self, image: np.ndarray) -> float:
         assert self._target is not None

@@ -13,10 +13,9 @@ from caustic_cli.errors import CausticError
 from caustic_cli.export import FORMATS
 from caustic_cli.kinds import OneSurface
 from caustic_cli.project import directory
-from caustic_cli.studies import report
+from caustic_cli.studies import design_report, report
 from caustic_cli.studies.report import Study
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow import evaluation
 
 DESIGN = ["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset", "--iterations", "1"]
 
@@ -31,7 +30,7 @@ def designed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(OneSurface, "final_rays", 2000)
-        patch.setattr(evaluation, "write_report", lambda *args: None)
+        patch.setattr(design_report, "write_report", lambda *args: None)
         write_picture()
         assert cli.run([*DESIGN, "--quiet", "--threads", "1"]) == 0
     return folder / "blob.caustic"

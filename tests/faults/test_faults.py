@@ -71,8 +71,8 @@ import json, resource, sys
 from caustic_cli import cli
 from caustic_cli.workflow import design as workflow
 from caustic_cli.kinds import OneSurface
-from caustic_cli.workflow import evaluation
-OneSurface.final_rays, evaluation.write_report = 5000, lambda *args: None
+from caustic_cli.studies import design_report
+OneSurface.final_rays, design_report.write_report = 5000, lambda *args: None
 resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))  # writing beyond fails as on a full disk
 for arguments in json.load(sys.stdin):
     print(cli.run(arguments), flush=True)

@@ -28,13 +28,13 @@ import torch
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.errors import InputError
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.io.files import CREATED_BY, write_bytes
 from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Scene, Screen, Source
+from caustic_cli.scene.traits import Capability
 
 #: Cells of the grid along its longer side, the finest that fits is used; multiples of COARSEST, by which the page subsamples it.
 CELLS = (1024, 768, 512, 384)
@@ -67,24 +67,21 @@ TRACED = frozenset(
 )
 #: Additive quasi-random sequence R2 in the unit square, powers of the inverse plastic number (Roberts 2018).
 EVEN = (0.7548776662466927, 0.5698402909980532)
-
-
-def unsupported(scene: Scene) -> str | None:
-    """Why the page does not support a scene, None if it does."""
-    if scene.screen.curved:
-        return "⟨html⟩: the page traces light to plane screens, not to curved ones"
-    if scene.lens.gradient is not None:
-        return "⟨html⟩: the page traces lenses of one index, and this one's varies"
-    if scene.unfolded.elements:
-        return "⟨html⟩: the page traces a single lens, and this scene has [[element]] tables"
-    if scene.two_sided:
-        return "⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form"
-    if any(one.rays is not None for one in scene.source.members):
-        return (
-            "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file; ⟨source.type⟩ renders it under"
-            " another light"
-        )
-    return None
+FILE = (
+    "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file; ⟨source.type⟩ renders it under another"
+    " light"
+)
+PAGE = Capability(
+    "interactive page",
+    {
+        "curved screen": "⟨html⟩: the page traces light to plane screens, not to curved ones",
+        "gradient index": "⟨html⟩: the page traces lenses of one index, and this one's varies",
+        "other elements": "⟨html⟩: the page traces a single lens, and this scene has [[element]] tables",
+        "two sides": "⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form",
+        "ray file": FILE,
+        "ray file among sources": FILE,
+    },
+)
 
 
 def write_page(
@@ -111,10 +108,9 @@ def write_page(
         encoding: of displayed images, srgb or linear.
 
     Raises:
-        InputError: the page does not support the scene, see `unsupported`, or the file cannot be written.
+        InputError: the page does not support the scene, see PAGE, or the file cannot be written.
     """
-    if why := unsupported(scene):
-        raise InputError(why)
+    PAGE.refuse(scene)
     scene = scene.unfolded
     screen, kind = _coarser(scene.screen), scene.lens.kind
     data = {

@@ -20,10 +20,12 @@ Unknown quantities are 0 or NaN.
 from __future__ import annotations
 
 import struct
+from typing import NamedTuple
 
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.io.rayfiles.binary import ray_table
 from caustic_cli.scene.sources.rayset import RaySet
 
 MAGIC = b"TM25"
@@ -31,14 +33,40 @@ VERSIONS = (2013, 2020)
 #: Bytes before the tables, their unit of padding, and of a column's name.
 HEADER, BLOCK, NAME = 36_288, 32, 512
 MOST_TABLES = 10_000
-#: Number of columns for each flag.
-COLUMNS = (3, 3, 1, 1, 1, 6, 2, 1)
-FLAGS = ("position", "direction", "radiant flux", "wavelength", "luminous flux", "Stokes", "tristimulus", "table number")
+#: What a ray may consist of, in the order of the flags, with its numbers of columns.
+COLUMNS = {
+    "position": 3,
+    "direction": 3,
+    "radiant flux": 1,
+    "wavelength": 1,
+    "luminous flux": 1,
+    "Stokes": 6,
+    "tristimulus": 2,
+    "table number": 1,
+}
 
 
 def begins(data: bytes) -> bool:
     """Whether the data are of this format."""
     return data.startswith(MAGIC)
+
+
+class _Header(NamedTuple):
+    """What a header declares."""
+
+    #: Of all rays, lm and W.
+    lumens: float
+    watts: float
+    rays: int
+    #: Identifier of spectral data, 0 to 4, and the single wavelength, nm.
+    spectrum: int
+    wavelength: float
+    #: Numbers of spectral tables and of additional columns, and bytes of additional text.
+    tables: int
+    more: int
+    text: int
+    #: Names of the columns that the rays have.
+    columns: frozenset[str]
 
 
 def parse(data: bytes) -> RaySet:
@@ -47,6 +75,24 @@ def parse(data: bytes) -> RaySet:
     Raises:
         InputError: it is invalid.
     """
+    header = _header(data)
+    start = _after_tables(data, header.tables) + NAME * header.more + header.text
+    widths = [n if name in header.columns else 0 for name, n in COLUMNS.items()]
+    table = ray_table(data, start, header.rays, sum(widths) + header.more)
+    at = dict(zip(COLUMNS, np.cumsum([0, *widths]).tolist(), strict=False))
+    flux, total, unit = "luminous flux", header.lumens, "lm"
+    if "radiant flux" in header.columns:
+        flux, total, unit = "radiant flux", header.watts, "W"
+    wavelengths = table[:, at["wavelength"]] if "wavelength" in header.columns else None
+    if header.spectrum == 1:
+        if not header.wavelength > 0:
+            raise InputError(f"declares a single wavelength of {header.wavelength:g} nm")
+        wavelengths = np.full(header.rays, header.wavelength)
+    return RaySet(table[:, 0:3], table[:, 3:6], table[:, at[flux]], total if np.isfinite(total) else 0.0, unit, wavelengths)
+
+
+def _header(data: bytes) -> _Header:
+    """The header, validated; errors as of `parse`."""
     if len(data) < HEADER:
         raise InputError(f"is cut off: the header of TM-25 is {HEADER:,} bytes, the file {len(data):,}")
     version, _, lumens, watts, rays = struct.unpack_from("<iiffQ", data, 4)
@@ -67,33 +113,17 @@ def parse(data: bytes) -> RaySet:
             f"counts {tables} spectral tables, {more} additional columns and {text} bytes of text; none may be"
             f" negative, and tables at most {MOST_TABLES:,}"
         )
-    for name, flag in zip(FLAGS, flags, strict=True):
+    for name, flag in zip(COLUMNS, flags, strict=True):
         if flag not in (0, 1):
             raise InputError(f"has a {name} flag of {flag}; 0 or 1 is needed")
-    if not (flags[0] and flags[1]):
+    columns = frozenset(name for name, flag in zip(COLUMNS, flags, strict=True) if flag)
+    if not {"position", "direction"} <= columns:
         raise InputError("declares rays without position or direction; both are needed")
-    if not (flags[2] or flags[4]):
+    if not {"radiant flux", "luminous flux"} & columns:
         raise InputError("declares rays with neither radiant nor luminous flux; one is needed")
-    if spectrum == 2 and not flags[3]:
+    if spectrum == 2 and "wavelength" not in columns:
         raise InputError("declares a wavelength for each ray, but has no column for it")
-    start = _after_tables(data, tables) + NAME * more + text
-    each = sum(n for n, flag in zip(COLUMNS, flags, strict=True) if flag) + more
-    if rays == 0:
-        raise InputError("holds no rays; at least one is needed")
-    whole = start + 4 * each * rays
-    if whole != len(data):
-        raise InputError(f"is {len(data):,} bytes, but its header and {rays:,} rays of {each} columns are {whole:,}")
-    table = np.frombuffer(data, dtype="<f4", count=each * rays, offset=start).reshape(rays, each)
-    at = dict(zip(FLAGS, np.cumsum([0, *(n * f for n, f in zip(COLUMNS, flags, strict=True))]).tolist(), strict=False))
-    radiant = bool(flags[2])
-    flux = table[:, at["radiant flux" if radiant else "luminous flux"]]
-    wavelengths = table[:, at["wavelength"]] if flags[3] else None
-    if spectrum == 1:
-        if not single > 0:
-            raise InputError(f"declares a single wavelength of {single:g} nm")
-        wavelengths = np.full(rays, single)
-    total = watts if radiant else lumens
-    return RaySet(table[:, 0:3], table[:, 3:6], flux, total if np.isfinite(total) else 0.0, "W" if radiant else "lm", wavelengths)
+    return _Header(lumens, watts, rays, spectrum, single, tables, more, text, columns)
 
 
 def _after_tables(data: bytes, tables: int) -> int:

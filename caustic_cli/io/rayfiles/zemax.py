@@ -16,6 +16,7 @@ import struct
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.io.rayfiles.binary import ray_table
 from caustic_cli.scene.sources.rayset import RaySet
 
 IDENTIFIERS = (1010, 8_675_309)
@@ -51,13 +52,7 @@ def parse(data: bytes) -> RaySet:
         raise InputError(f"has ray format {form}; 0 (flux) or 2 (flux and wavelength) is needed")
     if luminous not in (0, 1) or (form == 2 and luminous):
         raise InputError(f"has flux type {luminous} with ray format {form}; 0 (W), or 1 (lm) with ray format 0, is needed")
-    each = COLUMNS[form]
-    if rays == 0:
-        raise InputError("holds no rays; at least one is needed")
-    whole = HEADER + 4 * each * rays
-    if whole != len(data):
-        raise InputError(f"is {len(data):,} bytes, but its header and {rays:,} rays of {each} columns are {whole:,}")
-    table = np.frombuffer(data, dtype="<f4", offset=HEADER).reshape(rays, each)
+    table = ray_table(data, HEADER, rays, COLUMNS[form])
     wavelengths = 1000.0 * table[:, 7].astype(np.float64) if form == 2 else None
     if form == 0 and wavelength > 0:
         wavelengths = np.full(rays, 1000.0 * wavelength)

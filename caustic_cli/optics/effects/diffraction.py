@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from caustic_cli.optics.effects.base import Decision, Effect
 from caustic_cli.optics.resolution import WIDENED
-from caustic_cli.optics.waves.unsupported import limit_of
+from caustic_cli.optics.waves.unsupported import NOT_IMPLEMENTED, WAVE_IMAGE
 from caustic_cli.scene import Scene
 
 
@@ -20,8 +20,9 @@ class Diffraction(Effect):
     def decide(self, scene: Scene, bounds) -> Decision:
         """Needed if it increases the blur of source and pixel noticeably."""
         r = bounds.resolution
-        if limit := limit_of(scene):
-            return Decision(self.name, False, limit.why, r.widened, WIDENED, fixed=limit.fixed)
+        if obstacle := WAVE_IMAGE.obstacle(scene):
+            why, fixed = WAVE_IMAGE.unsupported[obstacle], obstacle in NOT_IMPLEMENTED
+            return Decision(self.name, False, why, r.widened, WIDENED, fixed=fixed)
         light = f"{r.wavelength:.4g} nm" if r.said else f"{r.wavelength:g} nm, as the scene says no wavelength,"
         why = f"light of {light} blurs over {r.diffraction:.2g} mm, the source over {r.source:.2g} mm, a pixel is {r.pixel:.2g} mm"
         return Decision(self.name, r.matters, why, r.widened, WIDENED)

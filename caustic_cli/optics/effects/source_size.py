@@ -8,7 +8,7 @@ from torch import Tensor
 
 from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Disc, Scene
-from caustic_cli.scene.sources.disc import SUN
+from caustic_cli.scene.sources.section import SUN
 
 #: Diameter of a near source for the measurement in a scene with a point source, mm; for a distant one it is the sun's angle.
 SIZE = 1.0

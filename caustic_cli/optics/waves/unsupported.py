@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.system import PlacedScreen, System
-from caustic_cli.scene import Scene, Screen, features
-from caustic_cli.scene.features import FEATURES
+from caustic_cli.scene import Screen
+from caustic_cli.scene.elements import NOT_BESIDE
+from caustic_cli.scene.traits import Capability
 
 #: Least cosine between a screen's normal and the axis: near grazing incidence off-axis light is parallel to the screen.
 LEAST_COSINE = 0.08
@@ -19,33 +17,40 @@ class NoWaveImage(CausticError):
     """The wave image of a scene is undefined, or cannot be computed."""
 
 
-@dataclass(frozen=True)
-class Limit:
-    """A trait of scenes that have no wave image."""
-
-    #: Whether a scene has it.
-    present: Callable[[Scene], bool]
-    #: Why there is no wave image then, a clause; and what to add to it for one that was asked for.
-    why: str
-    more: str = ""
-    #: Whether it is what is implemented that ends there, so that the effect cannot be asked for.
-    fixed: bool = False
-
-    def refusal(self) -> NoWaveImage:
-        """The error for a wave image that was asked for."""
-        return NoWaveImage(self.why + self.more)
-
-
-RAY_FILE = Limit(lambda s: s.source.rays is not None, "a ray file contains no phase", ", so that it has no wave image")
-CURVED = Limit(FEATURES[features.CURVED], "a curved screen has no wave image", ": the field is taken on planes")
-GRADIENT = Limit(FEATURES[features.GRADIENT], "wave images are implemented for homogeneous lenses only", fixed=True)
-ELEMENTS = Limit(FEATURES[features.ELEMENTS], "wave images are implemented for a single lens only", fixed=True)
-LIMITS = (RAY_FILE, CURVED, GRADIENT, ELEMENTS)
-
-
-def limit_of(scene: Scene) -> Limit | None:
-    """The first trait of a scene for which it has no wave image; None if there is none."""
-    return next((limit for limit in LIMITS if limit.present(scene)), None)
+#: Why a scene has no wave image, as clauses.
+WAVE_IMAGE = Capability(
+    "wave image",
+    {
+        "ray file": "a ray file contains no phase",
+        "curved screen": "a curved screen has no wave image",
+        "gradient index": "wave images are implemented for homogeneous lenses only",
+        "other elements": "wave images are implemented for a single lens only",
+    },
+)
+WAVE_REFINEMENT = Capability(
+    "design by waves",
+    {
+        "gradient index": "⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image",
+        "ray file": "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
+        "curved screen": "⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine",
+        "several sources": "⟨design.waves⟩ on needs one source: light of several is refined by rays alone",
+        "two sides": "⟨design.waves⟩ on: two free-form sides are refined by rays alone",
+        "other elements": f"⟨design.waves⟩ on{NOT_BESIDE}",
+    },
+)
+WAVES_BY_DEFAULT = Capability(
+    "design by waves unless asked for",
+    {name: WAVE_IMAGE.unsupported[name] for name in ("gradient index", "other elements", "ray file")}
+    | {
+        "several sources": "light of several sources is refined by rays alone",
+        "curved screen": WAVE_IMAGE.unsupported["curved screen"],
+        "lenslet array": "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on"
+        " refines it",
+        "tilted screen": "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same",
+    },
+)
+#: Of the scenes without a wave image, the limits of what is implemented, so that the effect cannot be asked for.
+NOT_IMPLEMENTED = ("gradient index", "other elements")
 
 
 def receiver_of(system: System, screen: Screen | PlacedScreen) -> Receiver:
@@ -56,10 +61,10 @@ def receiver_of(system: System, screen: Screen | PlacedScreen) -> Receiver:
         NoWaveImage: it is curved, or the rays are those of a file.
     """
     if system.source.rays is not None:
-        raise RAY_FILE.refusal()
+        raise NoWaveImage(f"{WAVE_IMAGE.unsupported['ray file']}, so that it has no wave image")
     found = Receiver.of(system, screen)
     if found.screen.curved:
-        raise CURVED.refusal()
+        raise NoWaveImage(f"{WAVE_IMAGE.unsupported['curved screen']}: the field is taken on planes")
     if abs(dot(found.axes[2], found.axis)) < LEAST_COSINE:
         raise InputError("⟨screen.tilt⟩ makes the screen nearly parallel to the light, where there is no wave image")
     return found

@@ -8,16 +8,20 @@ A new source type is a module of this package with its class, a `Source`, and wi
 from __future__ import annotations
 
 import pkgutil
+from functools import cache
 from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from caustic_cli.config import checks
 from caustic_cli.errors import InputError
+from caustic_cli.loading import OnDemand
 from caustic_cli.scene.sources.base import Source
-from caustic_cli.scene.sources.disc import SUN, Disc
 from caustic_cli.scene.sources.plane import PlaneWave
-from caustic_cli.scene.sources.points import Points
-from caustic_cli.scene.sources.section import COMMON, SourceType, Table
-from caustic_cli.scene.sources.several import Several, light_of_all, lights_of
+from caustic_cli.scene.sources.section import COMMON, SUN, SourceType, Table
+
+if TYPE_CHECKING:
+    from caustic_cli.scene.sources.disc import Disc
+    from caustic_cli.scene.sources.points import Points
 
 __all__ = [
     "COMMON",
@@ -28,7 +32,6 @@ __all__ = [
     "SourceType",
     "combined",
     "in_words",
-    "light_of_all",
     "names",
     "own_keys",
     "register",
@@ -36,19 +39,30 @@ __all__ = [
     "used_by",
 ]
 
+several = OnDemand("caustic_cli.scene.sources.several")
+#: Classes that are loaded when they are asked for, and their modules.
+_CLASSES = {"Disc": "disc", "Points": "points"}
 #: Modules in the order in which messages and comments list their types; others follow in alphabetical order.
 _FIRST = ("plane", "points", "disc")
-_TYPES: dict[str, SourceType] = {}
+
+
+@cache
+def _types() -> dict[str, SourceType]:
+    """The registry, made when it is first asked for."""
+    found = (module.name for module in pkgutil.iter_modules(__path__))
+    names = sorted(found, key=lambda name: (_FIRST.index(name) if name in _FIRST else len(_FIRST), name))
+    modules = [import_module(f"{__name__}.{name}") for name in names]
+    return {type.name: type for module in modules for type in getattr(module, "TYPES", ())}
 
 
 def register(type: SourceType) -> None:
     """Add a source type to the registry."""
-    _TYPES[type.name] = type
+    _types()[type.name] = type
 
 
 def names() -> tuple[str, ...]:
     """Names of all types."""
-    return tuple(_TYPES)
+    return tuple(_types())
 
 
 #: Common names of light sources, and the settings that describe each.
@@ -67,25 +81,25 @@ def type_of(name: str, where: str = "⟨source.type⟩") -> SourceType:
     Raises:
         InputError: naming `where`: there is none.
     """
-    if name in CALLED and name not in _TYPES:
+    if name in CALLED and name not in _types():
         raise InputError(f"{where} must be one of {', '.join(names())}, got {name!r}: {CALLED[name]}")
-    return _TYPES[checks.choice(where, name, names())]
+    return _types()[checks.choice(where, name, names())]
 
 
 def in_words() -> str:
     """All types in a line, for a comment."""
-    *others, last = (type.note for type in _TYPES.values())
+    *others, last = (type.note for type in _types().values())
     return f"{', '.join(others)} or {last}"
 
 
 def own_keys() -> dict[str, tuple[str, str]]:
     """Keys of [source] that belong to a single type, each with its kind and help."""
-    return {key: spec for type in _TYPES.values() for key, spec in type.own.items()}
+    return {key: spec for type in _types().values() for key, spec in type.own.items()}
 
 
 def used_by(key: str) -> tuple[str, ...]:
     """Names of the types that use a key of [source]."""
-    return tuple(name for name, type in _TYPES.items() if key in type.keys)
+    return tuple(name for name, type in _types().items() if key in type.keys)
 
 
 def combined(first: Source, section: Table) -> Source:
@@ -93,11 +107,11 @@ def combined(first: Source, section: Table) -> Source:
     if not section.get("also"):
         return first
     others = (type_of(table["type"], "⟨source.also.type⟩").from_settings(table, None) for table in section["also"])
-    return Several((first, *others), tuple((light.wavelengths, light.weights) for light in lights_of(section)))
+    lights = several.lights_of(section)
+    return several.Several((first, *others), tuple((light.wavelengths, light.weights) for light in lights))
 
 
-for _module in sorted(
-    (m.name for m in pkgutil.iter_modules(__path__)), key=lambda name: (_FIRST.index(name) if name in _FIRST else len(_FIRST), name)
-):
-    for _type in getattr(import_module(f"{__name__}.{_module}"), "TYPES", ()):
-        register(_type)
+def __getattr__(name: str) -> Any:
+    if name in _CLASSES:
+        return getattr(import_module(f"{__name__}.{_CLASSES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

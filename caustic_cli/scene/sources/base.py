@@ -19,7 +19,9 @@ import numpy as np
 
 from caustic_cli.scene.aperture import Pupil
 from caustic_cli.scene.sources.distribution import Distribution
-from caustic_cli.scene.sources.rayset import RaySet
+
+if TYPE_CHECKING:
+    from caustic_cli.scene.sources.rayset import RaySet
 
 #: Relative margin of a cone that just covers the aperture, so that rounding leaves no corner dark.
 SLACK = 1e-9

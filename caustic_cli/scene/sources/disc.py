@@ -25,8 +25,6 @@ from caustic_cli.scene.sources.section import (
     single_position,
 )
 
-#: Angular diameter of the sun, degrees.
-SUN = 0.533
 #: Intervals of each step that locates the farthest point of an ellipse, and steps: the angle to 1e-6, the distance to 1e-12.
 ZOOM, ZOOMS = 64, 4
 

@@ -16,6 +16,9 @@ from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
 
+#: Angular diameter of the sun, degrees.
+SUN = 0.533
+
 Table = Mapping[str, Any]
 #: Isotropic; proportional to the cosine of the angle to +z.
 INTENSITIES = ("uniform", "lambertian")

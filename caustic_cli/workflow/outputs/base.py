@@ -20,6 +20,7 @@ from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.project.project import RENDER, Project
 from caustic_cli.project.uptodate import FILES
 from caustic_cli.scene import Scene
+from caustic_cli.scene.traits import Capability
 from caustic_cli.workflow.lens import Lens, Render
 from caustic_cli.workflow.reporter import Reporter
 
@@ -190,6 +191,8 @@ class Output:
 
     #: The option that asks for it; "" for what every render writes.
     option: ClassVar[str] = ""
+    #: The scenes that it supports.
+    capability: ClassVar[Capability] = Capability("images", {})
     #: Names of its files, which lie beside the image.
     files: ClassVar[tuple[str, ...]] = ()
     #: Whether it goes beyond the images, so that its time does not count as the render's.
@@ -219,9 +222,9 @@ class Output:
         """The files it may write."""
         return tuple(map(place.beside, self.files))
 
-    def unsupported(self, lens: Lens) -> str | None:
-        """Why a lens does not have it, None if it does."""
-        return None
+    def unsupported(self, lens: Lens) -> str:
+        """Why a lens does not have it, "" if it does."""
+        return self.capability.why_not(lens.scene)
 
     def prepare(self, rendering: Rendering) -> None:
         """Read its input, before anything is traced.
@@ -238,9 +241,7 @@ class Output:
         """Print its figures, from those of the render; say: with `table` and `result`, as of the command line."""
 
 
-def not_single(option: str, lens: Lens) -> str | None:
-    """Why an output of single lenses of uniform index with a flat entrance does not support a lens."""
-    scene = lens.scene
-    beyond = "a free-form entrance" if scene.two_sided else "an index that varies" if scene.lens.gradient is not None else ""
-    beyond = "other elements beside it" if scene.unfolded.elements else beyond
-    return f"⟨{option}⟩ supports lenses of uniform index with a flat entrance, and this one has {beyond}" if beyond else None
+def single(name: str, option: str) -> Capability:
+    """A capability for single lenses of uniform index with a flat entrance alone; option: that asks for it."""
+    message = f"⟨{option}⟩ supports lenses of uniform index with a flat entrance, and this one has {{}}"
+    return Capability(name, dict.fromkeys(("other elements", "two sides", "gradient index"), message))

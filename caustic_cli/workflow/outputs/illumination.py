@@ -13,6 +13,7 @@ from caustic_cli.inverse.lenslets import lenslets
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.picture import read_picture, write_image
 from caustic_cli.optics.plan import compile_plan
+from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.brightness import brightness
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import retrace, white_level
@@ -25,6 +26,9 @@ class Illumination(Output):
     """The brightness of the source of each lenslet that gives the illumination `want`."""
 
     option: ClassVar[str] = "want"
+    capability: ClassVar[Capability] = Capability(
+        "illumination by an array", {"coloured picture": "⟨want⟩ is of brightness alone, and the project's picture has colours"}
+    )
     files: ClassVar[tuple[str, ...]] = ("wanted.png",)
     beyond: ClassVar[bool] = True
 
@@ -36,12 +40,10 @@ class Illumination(Output):
     def asks(self) -> dict[str, object]:
         return {"want": fingerprint(self.want)}
 
-    def unsupported(self, lens: Lens) -> str | None:
+    def unsupported(self, lens: Lens) -> str:
         if lens.project is None or not lens.scene.lens.arrayed:
             return "⟨want⟩ is for a project whose lens is an array of lenslets (caustic design with ⟨+lens.array⟩)"
-        if lens.scene.colored:
-            return "⟨want⟩ is of brightness alone, and the project's picture has colours"
-        return None
+        return super().unsupported(lens)
 
     def prepare(self, rendering: Rendering) -> None:
         assert rendering.place.project is not None

@@ -11,11 +11,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from caustic_cli import __version__
-from caustic_cli.export.page import TRACED, unsupported, write_page
+from caustic_cli.export.page import PAGE, TRACED, write_page
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.io.files import destination
 from caustic_cli.optics.plan import Plan
 from caustic_cli.scene import Scene
+from caustic_cli.scene.traits import Capability
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
@@ -36,6 +37,7 @@ class InteractivePage(Output):
     """The page at `html`."""
 
     option: ClassVar[str] = "html"
+    capability: ClassVar[Capability] = PAGE
 
     html: Path
 
@@ -44,9 +46,6 @@ class InteractivePage(Output):
 
     def paths(self, place: Place) -> tuple[Path, ...]:
         return (self.html,)
-
-    def unsupported(self, lens: Lens) -> str | None:
-        return unsupported(lens.scene)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """Write the page: page, its path."""

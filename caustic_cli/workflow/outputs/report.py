@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from caustic_cli.scene.traits import Capability
 from caustic_cli.studies import manufacture
-from caustic_cli.workflow.lens import Lens
-from caustic_cli.workflow.outputs.base import Output, Rendering, not_single
+from caustic_cli.workflow.outputs.base import Output, Rendering, single
 
 
 @dataclass(eq=False)
@@ -15,13 +15,11 @@ class ManufacturingReport(Output):
     """The figures; tool_radius: of a tool that is to fit in concave regions, mm."""
 
     option: ClassVar[str] = "report"
+    capability: ClassVar[Capability] = single("manufacturing report", "report")
     files: ClassVar[tuple[str, ...]] = ("report.json",)
     beyond: ClassVar[bool] = True
 
     tool_radius: float | None = None
-
-    def unsupported(self, lens: Lens) -> str | None:
-        return not_single("report", lens)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """report: the figures of `studies.manufacture`."""

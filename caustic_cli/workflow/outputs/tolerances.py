@@ -16,11 +16,12 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
+from caustic_cli.scene.traits import Capability
 from caustic_cli.studies import tolerances as study
 from caustic_cli.studies.irradiance import source_figures
 from caustic_cli.studies.tolerances_by_waves import WaveTrials
 from caustic_cli.workflow.lens import Lens
-from caustic_cli.workflow.outputs.base import Output, Rendering, not_single
+from caustic_cli.workflow.outputs.base import Output, Rendering, single
 
 
 @dataclass(eq=False)
@@ -31,6 +32,7 @@ class ToleranceAnalysis(Output):
     """
 
     option: ClassVar[str] = "tolerances"
+    capability: ClassVar[Capability] = single("tolerance analysis", "tolerances")
     files: ClassVar[tuple[str, ...]] = ("tolerances.csv", "tolerances.png")
     beyond: ClassVar[bool] = True
 
@@ -45,10 +47,10 @@ class ToleranceAnalysis(Output):
     def asks(self) -> dict[str, object]:
         return {"tolerances": self.errors}
 
-    def unsupported(self, lens: Lens) -> str | None:
+    def unsupported(self, lens: Lens) -> str:
         if lens.target is None:
             return "⟨tolerances⟩ compares with the picture, which an archive does not hold; render its project"
-        return not_single("tolerances", lens)
+        return super().unsupported(lens)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """tolerances: the figures of `studies.tolerances`, with the paths of both files.

@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
+from caustic_cli.scene.traits import Capability
 from caustic_cli.studies import verify
 from caustic_cli.workflow.export import at_own_wavelength
 from caustic_cli.workflow.lens import Lens
@@ -17,11 +18,12 @@ class MitsubaComparison(Output):
     """The comparison, at the index of a single wavelength."""
 
     option: ClassVar[str] = "verify"
+    capability: ClassVar[Capability] = verify.VERIFICATION
     files: ClassVar[tuple[str, ...]] = ("verify.png",)
     beyond: ClassVar[bool] = True
     kept: ClassVar[bool] = False
 
-    def unsupported(self, lens: Lens) -> str | None:
+    def unsupported(self, lens: Lens) -> str:
         return verify.unsupported(lens.scene)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:

@@ -66,12 +66,10 @@ class TwoSides(SeveralSurfaces):
 
     @classmethod
     def complete(cls, d: Defaults) -> None:
-        asked = check("design.waves", d.design.waves)
+        check("design.waves", d.design.waves)
         d.fill_design(start="transport")
         if d.design.start != "transport":
             raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {d.design.start}")
-        if asked == "on":
-            raise InputError("⟨design.waves⟩ on: two free-form sides are refined by rays alone")
         cls.complete_control(d)
         d.fill_design(preconditioner="laplacian")
         if not d.complete_given_stages():

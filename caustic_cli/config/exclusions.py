@@ -1,0 +1,101 @@
+"""Settings that exclude each other, and why: one table."""
+
+from __future__ import annotations
+
+from caustic_cli.config.settings import Settings
+from caustic_cli.config.table import TABLE, default
+from caustic_cli.errors import InputError
+from caustic_cli.optics.waves.unsupported import WAVE_REFINEMENT, WAVES_BY_DEFAULT
+from caustic_cli.scene.elements import NOT_BESIDE
+from caustic_cli.scene.traits import TRAITS, Capability
+
+
+def _by_settings(capability: Capability) -> dict[str, str]:
+    """The messages of a capability for the settings by which a scene gets what it does not support."""
+    return {entry: message for trait, message in capability.unsupported.items() for entry in TRAITS[trait].settings}
+
+
+_LENSLETS = (
+    "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none and optimizer"
+    " lbfgs"
+)
+_TWO_SIDES = {
+    **dict.fromkeys(
+        ("lens.mirror", "target.color", "lens.gradient", "lens.array", "design.robust", "design.network", "design.optimizer"),
+        "⟨{path}⟩ cannot be combined with ⟨{feature}⟩, which needs two free-form sides of heights by lbfgs",
+    ),
+    **dict.fromkeys(("source.also", "source.type rays"), "⟨{feature}⟩ needs one source that is no ray file"),
+    "design.waves on": WAVE_REFINEMENT.unsupported["two sides"],
+}
+
+#: Feature -> settings that exclude it -> message.  Both are settings with any value but the default, or with one.  In messages
+#: {path} and {value} are those of the setting, {said} both of them, or the path of a flag alone, {default} its default, and
+#: {feature} the feature.
+EXCLUDED: dict[str, dict[str, str]] = {
+    "target.color": {"source.also": "[[source]] of a coloured picture must be one, whose three wavelengths are its colours"},
+    **dict.fromkeys(TRAITS["two sides"].settings, _TWO_SIDES),
+    "element": {
+        **dict.fromkeys(TRAITS["two sides"].settings, "⟨{path}⟩" + NOT_BESIDE),
+        "lens.gradient": "{said}" + NOT_BESIDE,
+    },
+    "element.reshapes": dict.fromkeys(("design.robust", "design.waves on"), "{said}" + NOT_BESIDE),
+    "element.free": dict.fromkeys(
+        ("design.network", "design.optimizer", "target.color"),
+        "{said} cannot be combined with ⟨element.free⟩: it is not implemented beside other free surfaces",
+    ),
+    "lens.gradient free": {
+        "lens.mirror": "⟨lens.gradient⟩ free needs a lens: light never enters a mirror",
+        "lens.array": "⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat",
+        "target.color": "⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength",
+        "design.robust": "{said} averages over errors of a designed surface, but ⟨lens.gradient⟩ free designs the index",
+        **dict.fromkeys(
+            ("design.network", "design.optimizer", "design.loss"), "⟨{path}⟩ of a free gradient must be {default}, got {value}"
+        ),
+        "design.waves on": WAVE_REFINEMENT.unsupported["gradient index"],
+    },
+    "design.over": {"design.robust": "⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already"},
+}
+#: The same of what follows from other settings, too.
+EXCLUDED_LATER: dict[str, dict[str, str]] = {
+    "lens.array": dict.fromkeys(("design.start offset", "design.network", "design.optimizer"), _LENSLETS),
+    "design.waves on": {
+        "design.network": "⟨design.waves⟩ on needs network none: the wave image is refined by control heights",
+        **_by_settings(WAVE_REFINEMENT),
+    },
+    "design.waves auto": {
+        **_by_settings(WAVES_BY_DEFAULT),
+        "design.network": "a network is trained on rays alone; ⟨network⟩ none refines it",
+        "design.optimizer": "{value} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it",
+    },
+}
+
+
+def why_excluded(feature: str, s: Settings) -> str:
+    """Why settings exclude a feature, "" if they do not."""
+    for entry, message in (EXCLUDED | EXCLUDED_LATER)[feature].items():
+        if value := s.chosen(entry):
+            path = entry.partition(" ")[0]
+            said, usual = f"⟨{path}⟩" if value is True else f"⟨{path}⟩ {value}", default(path) if path in TABLE else ""
+            return message.format(path=path, value=value, said=said, default=usual, feature=feature)
+    return ""
+
+
+def refuse_excluded(feature: str, s: Settings) -> None:
+    """Refuse settings that exclude a feature.
+
+    Raises:
+        InputError: they do.
+    """
+    if why := why_excluded(feature, s):
+        raise InputError(why)
+
+
+def refuse_contradictions(s: Settings) -> None:
+    """Refuse settings of which one excludes another.
+
+    Raises:
+        InputError: there are such.
+    """
+    for feature in EXCLUDED:
+        if s.chosen(feature):
+            refuse_excluded(feature, s)

@@ -1,0 +1,86 @@
+"""What each export format does not hold of a scene, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from caustic_cli.export import FORMATS, SOLIDS
+from caustic_cli.scene import Scene
+from caustic_cli.scene.traits import BEYOND_CLEAR, Capability
+
+#: Formats that hold a single refractive index, and formats that hold two free-form sides.
+ONE_INDEX, TWO_SIDED = ("lighttools", "zemax", "mitsuba"), ("lighttools", *SOLIDS, "mitsuba")
+
+ONE_SIDE = (
+    f"⟨format⟩ {{format}} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both, without ⟨script⟩"
+    " or ⟨mould⟩"
+)
+ONE_LENS = f"⟨format⟩ {{format}} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
+SHAPE = (
+    "⟨format⟩ {format} holds one index, and this lens' varies;"
+    f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold its shape alone"
+)
+SOURCE = "⟨format⟩ {format} does not support sources of type {scene.source.kind}"
+
+#: Beyond what ONE_INDEX and TWO_SIDED say.
+_UNSUPPORTED: dict[str, Mapping[str, str]] = {
+    "zemax": {"other elements": ONE_LENS},
+    "lighttools": {"user-defined source": SOURCE},
+    "mitsuba": {
+        **dict.fromkeys(
+            [name for name in BEYOND_CLEAR if name not in ("mirror", "gradient index", "shifted screen")],
+            "⟨format⟩ mitsuba is written for clear lenses and straight screens, not {}",
+        ),
+        **dict.fromkeys(("ray file", "several sources", "user-defined source"), SOURCE),
+        "uneven plane wave": "⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written",
+        **dict.fromkeys(
+            ("disc at infinity", "disc not Lambertian", "disc in a cone"),
+            "⟨format⟩ mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at infinity; render"
+            " ⟨verify⟩ mitsuba traces them all",
+        ),
+        "uneven source": "⟨format⟩ mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written",
+        "line source": "⟨format⟩ mitsuba: its disc shines by its area, so one without any cannot be written",
+        "uneven points": "⟨format⟩ mitsuba: its spots shine evenly, so points of another intensity cannot be written",
+    },
+}
+
+
+def _exported(format: str) -> Capability:
+    two_sides = {} if format in TWO_SIDED else {"two sides": ONE_SIDE}
+    index = {"gradient index": SHAPE} if format in ONE_INDEX else {}
+    return Capability(f"export to {format}", two_sides | index | _UNSUPPORTED.get(format, {}))
+
+
+EXPORT: dict[str, Capability] = {format: _exported(format) for format in FORMATS}
+MOULD = Capability("moulds", {"two sides": ONE_SIDE})
+SCRIPT = Capability(
+    "script for LightTools",
+    {
+        "two sides": ONE_SIDE,
+        **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
+        **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
+        "gradient index": SHAPE,
+        "lumens": "⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written",
+        "uneven plane wave": "⟨script⟩: its source is uniform, so one with a profile cannot be written",
+        **dict.fromkeys(
+            ("uneven source", "ray file", "tabulated intensity"),
+            "⟨script⟩: its source is evenly bright and uniform or Lambertian, so a picture, a table or a ray file cannot be"
+            " written",
+        ),
+        "several sources": "⟨script⟩ builds one source, so that several, which the archive alone holds, cannot be written",
+        "user-defined source": SOURCE,
+        "elliptical disc": "⟨script⟩: its disc is round, so an elliptical one cannot be written",
+        "circular aperture": "⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written",
+    },
+)
+
+
+def refuse(scene: Scene, format: str, script: bool, mould: bool) -> None:
+    """Refuse a scene that a format does not hold, or not with a script or as a mould.
+
+    Raises:
+        InputError: it is not supported.
+    """
+    for asked, capability in ((True, EXPORT[format]), (script, SCRIPT), (mould, MOULD)):
+        if asked:
+            capability.refuse(scene, format=format)

@@ -1,0 +1,52 @@
+"""All capabilities with the scenes that they support: the matrix in the documents, and tests, follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import import_module
+
+from caustic_cli.scene.traits import TRAITS, Capability
+
+#: Where they stand; of a mapping or a list, those of all entries.
+PLACES = (
+    "scene.elements:BESIDE_ELEMENTS",
+    "scene.elements:BESIDE_LENSES",
+    "optics.waves.unsupported:WAVE_IMAGE",
+    "optics.waves.unsupported:WAVE_REFINEMENT",
+    "optics.waves.unsupported:WAVES_BY_DEFAULT",
+    "inverse.gradient_index:INDEX_DESIGN",
+    "inverse.lenslets:LENSLETS",
+    "inverse.reachability:REACHABILITY",
+    "inverse.source_limits:LIMITS",
+    "inverse.source_limits:CONVOLUTION",
+    "optics.source_image:SOURCE_IMAGES",
+    "optics.resolution:PARAXIAL",
+    "studies.manufacture:WALL",
+    "studies.manufacture:THROW",
+    "workflow.outputs:OUTPUTS",
+    "studies.gradmap:DERIVATIVE",
+    "export.supported:EXPORT",
+    "export.supported:MOULD",
+    "export.supported:SCRIPT",
+    "workflow.convergence:STUDIES",
+    "workflow.architectures:NETWORKS",
+)
+
+
+def capabilities() -> Iterator[Capability]:
+    """All of them."""
+    for place in PLACES:
+        module, _, name = place.partition(":")
+        found = getattr(import_module(f"caustic_cli.{module}"), name)
+        for one in [found] if isinstance(found, Capability) else found.values() if isinstance(found, dict) else found:
+            yield getattr(one, "capability", one)
+
+
+def matrix() -> str:
+    """What is not supported, as a table in Markdown: a row for the capabilities that support the same scenes."""
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for one in capabilities():
+        if one.unsupported:
+            alike.setdefault(tuple(name for name in TRAITS if name in one.unsupported), []).append(one.name)
+    rows = [f"| {', '.join(names)} | {', '.join(TRAITS[name].words for name in traits)} |" for traits, names in alike.items()]
+    return "\n".join(["| capability | not for |", "| --- | --- |", *rows])
