@@ -41,8 +41,9 @@ EXCLUDED: dict[str, dict[str, str]] = {
     **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
     "element": {
         **dict.fromkeys(TRAITS["two sides"].settings, "⟨{path}⟩" + NOT_BESIDE),
-        **dict.fromkeys(("design.robust", "design.waves on", "lens.gradient"), "{said}" + NOT_BESIDE),
+        "lens.gradient": "{said}" + NOT_BESIDE,
     },
+    "element.reshapes": dict.fromkeys(("design.robust", "design.waves on"), "{said}" + NOT_BESIDE),
     "element.free": dict.fromkeys(
         ("design.network", "design.optimizer", "target.color"),
         "{said} cannot be combined with ⟨element.free⟩: it is not implemented beside other free surfaces",

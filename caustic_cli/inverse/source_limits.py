@@ -43,7 +43,7 @@ CONVOLUTION = Capability(
     {
         "separate places": "its places have images of their own",
         **dict.fromkeys(("tilted screen", "curved screen"), "the image of the source varies over the screen"),
-        "other elements": "the blur by the lens alone is not that on the screen",
+        **dict.fromkeys(("other elements", "folded axis"), "the blur by the lens alone is not that on the screen"),
     },
 )
 
@@ -86,6 +86,7 @@ def performance_limits(scene: Scene, target: np.ndarray, most: int = STANDARD.bo
     target: (n, m) irradiance, or (3, n, m) in colour, whose bound is the mean of its colours', as their error is; most:
     iterations, as of `error_bound`.
     """
+    scene = scene.unfolded
     if not (scene.source.extended and LIMITS.supports(scene)):
         return SourceLimits(None, None)
     images = source_images(scene)

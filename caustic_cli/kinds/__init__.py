@@ -21,6 +21,7 @@ KINDS = (
     ("element", "elements.FreeElements"),
     ("design.over", "network_range.NetworkAmongElements"),
     ("design.over", "network_range.NetworkOverRange"),
+    ("design.robust", "robust.RobustAmongElements"),
     ("element", "elements.AmongElements"),
     ("design.robust", "robust.RobustArray"),
     ("lens.array", "lenslet_array.LensletArray"),

@@ -44,11 +44,19 @@ class AmongElements(OneSurface):
             )
         return low, high
 
+    @property
+    def _folded(self) -> bool:
+        """Whether the other elements only fold the axis."""
+        return not self.scene.unfolded.elements
+
     def refuse_unreachable(self) -> None:
-        """The transport says what it cannot reach."""
+        """Behind elements that do more than fold the axis, the transport says what it cannot reach."""
+        if self._folded:
+            super().refuse_unreachable()
 
     def resolution_notes(self, seen: Resolution) -> Iterator[str]:
-        yield from ()
+        if self._folded:
+            yield from super().resolution_notes(seen)
 
 
 class FreeElements(SeveralSurfaces, AmongElements):

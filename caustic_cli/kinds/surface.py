@@ -312,7 +312,7 @@ class OneSurface(Problem):
             InputError: the screen is obstructed, or the picture cannot be reached by refraction.
         """
         for scene in self.scenes:
-            refuse_unreachable(scene, grey(self.target.numpy()))
+            refuse_unreachable(scene.unfolded, grey(self.target.numpy()))
 
     def refuse_obstructed(self) -> None:
         """Refuse a screen that is in the light of its source.
