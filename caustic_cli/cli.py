@@ -60,9 +60,7 @@ def _run(arguments: list[str]) -> int:
     except BrokenPipeError:
         return _closed_pipe()
     except SystemExit as stop:
-        if isinstance(stop.__context__, OSError) and stop.__context__.errno == errno.EPIPE:  # Typer's reaction to a closed pipe
-            return _closed_pipe()
-        return stop.code if isinstance(stop.code, int) else 1
+        return _exited(stop)
     except typer.Exit as stop:
         return stop.exit_code
     except typer.Abort as stop:
@@ -76,6 +74,13 @@ def _run(arguments: list[str]) -> int:
         if debug:
             raise
         return _report(problem)
+
+
+def _exited(stop: SystemExit) -> int:
+    """Exit status of an exit, such as Typer's reaction to a closed pipe."""
+    if isinstance(stop.__context__, OSError) and stop.__context__.errno == errno.EPIPE:
+        return _closed_pipe()
+    return stop.code if isinstance(stop.code, int) else 1
 
 
 def _closed_pipe() -> int:

@@ -13,7 +13,7 @@ from helpers import write_blob
 from rich.console import Console
 
 from caustic_cli import cli
-from caustic_cli.commands.console import Reporter, ended_words
+from caustic_cli.commands.console import ConsoleReporter, ended_words
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.kinds import OneSurface
 from caustic_cli.project import checkpoint
@@ -338,7 +338,7 @@ def test_a_small_cost_is_not_rounded_to_nothing(value, noise, words):
 def test_time_left_is_shown_on_every_terminal(width):
     """Of the iterations, and of the evaluation after the last one."""
     shown = io.StringIO()
-    reporter = Reporter()
+    reporter = ConsoleReporter()
     reporter.console = Console(file=shown, force_terminal=True, width=width)
     with reporter.progress(14) as show:
         show("stage 1/1", "loss 0.1000  on screen 91.0%", 14, 14)

@@ -350,7 +350,7 @@ def test_the_table_fits_a_terminal_and_any_encoding(monkeypatch, capfd, encoding
         patch.setattr(sys.stdout, "isatty", lambda: True)
         patch.setenv("COLUMNS", "50")
         sys.stdout.reconfigure(encoding=encoding)
-        console.Reporter().table("a title", rows)
+        console.ConsoleReporter().table("a title", rows)
     sys.stdout.reconfigure(encoding="utf-8")
     lines = capfd.readouterr().out.splitlines()
     assert len(lines) > 5 and max(map(len, lines)) <= 50 + 3 * (encoding == "ascii")
@@ -619,7 +619,7 @@ def test_the_progress_bar_draws_on_a_terminal(total, monkeypatch, capfd):
     """Also while its total is not known yet, as a study's is not at first."""
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     monkeypatch.setenv("TERM", "xterm")
-    reporter = console.Reporter()
+    reporter = console.ConsoleReporter()
     reporter.console._force_terminal = True
     with reporter.progress(total) as show:
         reporter.console.print("", end="")

@@ -253,7 +253,7 @@ def test_compilation_is_spoken_of_where_something_is_compiled(monkeypatch):
     """Once a block; not for what is compiled already, nor for what is slow but compiles nothing."""
     monkeypatch.setattr(compilation, "PATIENCE", 0.05)
     said = []
-    say = console.Reporter(False)
+    say = console.ConsoleReporter(False)
     monkeypatch.setattr(say, "say", said.append)
     slow = numba.njit(lambda x: np.cos(np.sin(x)) + np.ones(3).sum())
     with compilation.announce_compilation(say, "compiling"):

@@ -16,7 +16,7 @@ from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.source_limits import source_spread
-from caustic_cli.inverse.two_sided import TwoSidedObjective
+from caustic_cli.inverse.two_sided_objective import TwoSidedObjective
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter

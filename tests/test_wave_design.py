@@ -24,7 +24,7 @@ from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.schedule import LossImage
-from caustic_cli.inverse.waves import WaveObjective
+from caustic_cli.inverse.wave_objective import WaveObjective
 from caustic_cli.kinds import OneSurface
 from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_magnification, white
 from caustic_cli.optics.surfaces import HeightField

@@ -47,7 +47,7 @@ class _TimeLeft(ProgressColumn):
         return Text(f"about {left:.0f} s left" if left >= 1.0 else "longer than expected" if left < -1.0 else "nearly done")
 
 
-class Reporter:
+class ConsoleReporter:
     """Messages to the user on stderr, unless `quiet`; results on stdout, unless `as_json`: a JSON object stands for them there.
     Colour follows the terminal and NO_COLOR.
 

@@ -145,7 +145,7 @@ def _kinds(asked: ConvergenceOptions) -> list[StudyKind]:
     return list(STUDIES.values()) if asked.study == "all" else [STUDIES[asked.study]]
 
 
-def _show(kind: StudyKind, found: Study, paths: list[Path], say: console.Reporter) -> None:
+def _show(kind: StudyKind, found: Study, paths: list[Path], say: console.ConsoleReporter) -> None:
     rows = [
         (
             name,

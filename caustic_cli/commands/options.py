@@ -18,7 +18,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from caustic_cli.commands import console
-from caustic_cli.commands.console import Reporter
+from caustic_cli.commands.console import ConsoleReporter
 from caustic_cli.config import checks, table
 from caustic_cli.config.table import Setting
 from caustic_cli.errors import InputError, near, no_project
@@ -55,9 +55,9 @@ class Given:
         vars(self).update(values)
 
     @cached_property
-    def say(self) -> Reporter:
+    def say(self) -> ConsoleReporter:
         """Where results and messages go."""
-        return Reporter(self.quiet, self.progress, self.json)
+        return ConsoleReporter(self.quiet, self.progress, self.json)
 
 
 class Presentation(Given):
@@ -521,7 +521,7 @@ def require_project(path: Path, archives: bool = False) -> None:
     raise no_project(path)
 
 
-def start_torch(device: str, threads: int | None, say: Reporter):
+def start_torch(device: str, threads: int | None, say: ConsoleReporter):
     """Load torch, set its number of threads and choose the device ("cpu" or "cuda"), with a message about CUDA.
 
     Raises:

@@ -130,50 +130,48 @@ def design_gradient_index(
 
     initial = volume(layer[:, :, None].expand(-1, -1, layers).contiguous())
     objective = _IndexObjective(scene, target, initial, rays or RAYS_A_PIXEL * math.prod(scene.screen.resolution), seed)
-    values = _Layers(layer, layers, (low, high))
-    evaluations: dict[float, Evaluation] = {}
-
-    def evaluate(x: Tensor) -> tuple[float, Tensor]:
-        net = values.at(x)
-        try:
-            result = objective.evaluate({objective.name: net.detach()})
-        except NoLight:
-            if search.f is None:
-                raise
-            return math.inf, torch.zeros_like(x)  # treated as too long by the line search
-        evaluations[result.loss] = result
-        return result.loss, values.pulled_back(net, result.gradients[objective.name])
-
-    search = LBFGS(evaluate, torch.zeros(layers * math.prod(control), dtype=torch.float64))
+    loss = _LossOfLayers(objective, layer, layers, (low, high))
+    search = LBFGS(loss, torch.zeros(layers * math.prod(control), dtype=torch.float64))
     history: list[tuple[float, float]] = []
     for k in range(iterations):
-        evaluations.clear()
+        loss.evaluations.clear()
         if stop() or not search.step():
             break
         assert search.f is not None
-        result = evaluations[search.f]
+        result = loss.evaluations[search.f]
         history.append((search.f, result.on_screen))
         on_iteration(k + 1, search.f, result.on_screen, result.image)
     with torch.no_grad():
-        return GradientIndexDesign(volume(values.at(search.x)), initial, tuple(history))
+        return GradientIndexDesign(volume(loss.values(search.x)), initial, tuple(history))
 
 
-class _Layers:
-    """Control values (n, m, layers) within limits as a function of unknowns x (layers n m,), which are 0 for layers all alike."""
+class _LossOfLayers:
+    """The loss as a function of unknowns x (layers n m,), which are 0 for control values (n, m, layers) of layers all alike."""
 
-    def __init__(self, layer: Tensor, layers: int, limits: tuple[float, float]):
+    def __init__(self, objective: _IndexObjective, layer: Tensor, layers: int, limits: tuple[float, float]):
         low, high = (torch.full_like(layer, limit, dtype=torch.float64) for limit in limits)
-        self.nets = [FreeHeights(low, high, layer, laplacian=True) for _ in range(layers)]
+        self.objective, self.nets = objective, [FreeHeights(low, high, layer, laplacian=True) for _ in range(layers)]
+        #: By their loss.
+        self.evaluations: dict[float, Evaluation] = {}
+        self.is_lit = False
 
-    def at(self, x: Tensor) -> Tensor:
-        """The values at x."""
+    def values(self, x: Tensor) -> Tensor:
+        """The control values at x, within the limits."""
         for net, y in zip(self.nets, x.view(len(self.nets), *self.nets[0].y.shape), strict=True):
             net.y.data = y.clone()
         return torch.stack([net() for net in self.nets], -1)
 
-    def pulled_back(self, values: Tensor, gradient: Tensor) -> Tensor:
-        """Gradient by x from that by the values, which are the last ones of `at`."""
-        return torch.stack(torch.autograd.grad(values, [net.y for net in self.nets], gradient)).reshape(-1)
+    def __call__(self, x: Tensor) -> tuple[float, Tensor]:
+        values, name = self.values(x), self.objective.name
+        try:
+            result = self.objective.evaluate({name: values.detach()})
+        except NoLight:
+            if not self.is_lit:
+                raise
+            return math.inf, torch.zeros_like(x)  # treated as too long by the line search
+        self.evaluations[result.loss], self.is_lit = result, True
+        by = torch.autograd.grad(values, [net.y for net in self.nets], result.gradients[name])
+        return result.loss, torch.stack(by).reshape(-1)
 
 
 def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], limits: tuple[float, float], cells: int) -> Tensor:

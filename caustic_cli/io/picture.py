@@ -191,10 +191,10 @@ def _decoded(path: Path | Piped) -> Image.Image:
 
 def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> Picture:
     image, encoding = _decoded(path), "linear" if linear else "srgb"
-    if color and image.mode != "F" and not image.mode.startswith("I"):
-        return _lit(path, image, Picture(_over_ground(image, linear, white), encoding))
     if color:
-        raise InputError(f"{path}: has no colours (mode {image.mode}); a colour image of 8 bits is needed")
+        if image.mode.startswith(("F", "I")):
+            raise InputError(f"{path}: has no colours (mode {image.mode}); a colour image of 8 bits is needed")
+        return _lit(path, image, Picture(_over_ground(image, linear, white), encoding))
     if image.mode == "F":
         values = np.asarray(image, dtype=np.float64)
         if not np.isfinite(values).all() or (values < 0).any():

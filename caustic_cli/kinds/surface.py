@@ -56,7 +56,7 @@ from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import retrace
 
-waves, manufacture = OnDemand("caustic_cli.inverse.waves"), OnDemand("caustic_cli.studies.manufacture")
+waves, manufacture = OnDemand("caustic_cli.inverse.wave_objective"), OnDemand("caustic_cli.studies.manufacture")
 
 DEFAULT_SPANS = 128  # knot spans of the final net; divisible by 2 through the stages
 NETWORK_CONTROL = 50  # table D.2

@@ -20,7 +20,7 @@ from caustic_cli.inverse.internal_rays import entrance_points
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.parametrisation import Heights, SidesTogether
 from caustic_cli.inverse.target import grey
-from caustic_cli.inverse.two_sided import TwoSidedObjective
+from caustic_cli.inverse.two_sided_objective import TwoSidedObjective
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.evaluation import Evaluated, radius_figures
 from caustic_cli.kinds.several_surfaces import SeveralSurfaces

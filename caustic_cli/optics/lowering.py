@@ -21,8 +21,12 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
     prepared arrays are reused."""
     system, start, (inside, outside) = tracer.system, tracer.start, tracer.media[-2:]
     element = system.elements[-1]
-    asked = tracer.requests.stages or tracer.actions or tracer.track or any(medium.varies for medium in tracer.media)
-    if asked or tracer.first != len(system.elements) - 1 or not _is_plain(element, system.pupil) or tracer.sides[-1] < 0:
+    if (
+        _needs_stages(tracer)
+        or tracer.first != len(system.elements) - 1
+        or not _is_plain(element, system.pupil)
+        or tracer.sides[-1] < 0
+    ):
         return None
     if not _are_plain(start) or not (system.lit or tracer.first):
         return None
@@ -34,6 +38,11 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
     if element.aperture != system.pupil.aperture:
         return None
     return tracer.backend.plane_image(element.surface, start, eta, element.fresnel, previous)
+
+
+def _needs_stages(tracer) -> bool:
+    """Whether effects, the outcome of every ray or a gradient index need the trace by stages, or it is asked for."""
+    return bool(tracer.requests.stages or tracer.actions or tracer.track) or any(medium.varies for medium in tracer.media)
 
 
 def _is_plain(element: Element, pupil: Pupil) -> bool:

@@ -39,7 +39,7 @@ DOUBLINGS, BISECTIONS, SHORTER = 16, 7, 0.95
 
 
 @dataclass(frozen=True)
-class Body:
+class Obstacle:
     """A box or a cylinder, with the name by which messages call it."""
 
     name: str
@@ -67,7 +67,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class ScreenBody:
+class ScreenObstacle:
     """A screen as flat pieces, one unless it is curved."""
 
     screen: Screen
@@ -77,7 +77,7 @@ class ScreenBody:
     depth = 0.0, 0.0
 
     @property
-    def pieces(self) -> list[Body]:
+    def pieces(self) -> list[Obstacle]:
         """Its pieces."""
         (hx, hy), k = self.screen.half_size, shape_of(self.screen).pieces
         x, y = (np.linspace(-h, h, k + 1) for h in (hx, hy))
@@ -90,7 +90,7 @@ class ScreenBody:
             wide, tall = np.linalg.norm(a), np.linalg.norm(b)
             axes = tuple(tuple(map(float, axis)) for axis in (a / wide, np.cross(n, a / wide), n))
             middle = tuple(map(float, corners.mean((0, 1))))
-            found.append(Body(self.name, middle, axes, Aperture((float(wide) / 2.0, float(tall) / 2.0))))  # type: ignore[arg-type]
+            found.append(Obstacle(self.name, middle, axes, Aperture((float(wide) / 2.0, float(tall) / 2.0))))  # type: ignore[arg-type]
         return found
 
     def crossed(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -140,7 +140,7 @@ class LightPath:
         screen = self.screen
         if shift is not None:
             screen = replace(screen, screen=replace(screen.screen, shift=shift))
-        stations: list[Body | ScreenBody] = [*self.elements, screen]
+        stations: list[Obstacle | ScreenObstacle] = [*self.elements, screen]
         bodies, first = [*stations, *self.sources], stations[0]
         found = [
             (sum(float(power[body.crossed(start, end)].sum()) for own, start, end, power in self.emitted if body not in own), body)
@@ -233,26 +233,26 @@ def _(aperture: CircularAperture, o: np.ndarray, d: np.ndarray) -> list[tuple[np
     return [(enter, np.where(still, -enter, np.where(missed, -np.inf, leave)))]
 
 
-def _stations(scene: Scene) -> tuple[list[Body], ScreenBody]:
+def _stations(scene: Scene) -> tuple[list[Obstacle], ScreenObstacle]:
     """The elements in the order in which light reaches them, and the screen."""
     lens, leg = scene.lens, AxisSegment()
 
-    def body(number: int, part: Component) -> Body:
+    def body(number: int, part: Component) -> Obstacle:
         pose, (low, high) = leg.pose(part.z, part.tilt), part.extent
         name, depth = f"the {part.kind} of [[element]] {number + 1}", (low - part.z, high - part.z)
-        return Body(name, pose.position, pose.axes, part.opening, depth)
+        return Obstacle(name, pose.position, pose.axes, part.opening, depth)
 
     found = [body(k, part) for k, part in enumerate(scene.in_front)]
     name = "the free-form lens" if scene.elements else f"the {lens.kind}"
     depth = lens.interaction.extent(lens.lowest, lens.offset.thickness)
-    found.append(Body(name, (0.0, 0.0, 0.0), IDENTITY, lens.opening.grown(lens.border), depth))
+    found.append(Obstacle(name, (0.0, 0.0, 0.0), IDENTITY, lens.opening.grown(lens.border), depth))
     for k, part in enumerate(scene.behind, len(scene.in_front)):
         found.append(body(k, part))
         leg = part.axis_behind(leg)
-    return found, ScreenBody(scene.screen, leg)
+    return found, ScreenObstacle(scene.screen, leg)
 
 
-def _sources(scene: Scene) -> list[Body]:
+def _sources(scene: Scene) -> list[Obstacle]:
     """Near sources that have a size."""
     found = []
     for one in scene.source.members:
@@ -263,13 +263,13 @@ def _sources(scene: Scene) -> list[Body]:
         wide, high = (float(np.ptp(places[:, k])) / 2.0 + extent[k] for k in (0, 1))
         if min(wide, high) > 0:
             outline = CircularAperture if wide == high and len(places) == 1 else Aperture
-            found.append(Body("the source", (x, y, z), IDENTITY, outline((wide, high))))
+            found.append(Obstacle("the source", (x, y, z), IDENTITY, outline((wide, high))))
     return found
 
 
 def _from_source(
-    scene: Scene, stations: Sequence[Body | ScreenBody]
-) -> list[tuple[list[Body], np.ndarray, np.ndarray, np.ndarray]]:
+    scene: Scene, stations: Sequence[Obstacle | ScreenObstacle]
+) -> list[tuple[list[Obstacle], np.ndarray, np.ndarray, np.ndarray]]:
     """Rays of each source that fall on the first element: the source's own body, starts and ends, (N, 3) mm, and fractions of all
     that light, (N,)."""
     u, v = np.array([[0.0, 0.0, 1.0, 1.0], [0.0, 1.0, 0.0, 1.0]])

@@ -31,7 +31,7 @@ def meet(tracer, m, heights: Tensor | None) -> None:
         return
     state = state.expanded()
     o, d = to_local(element.pose, state.origin, state.direction, state.datum)
-    if m.index == 0 and m.forward and prepared is None and system.lit is None and not element.surface.flat:
+    if m.index == 0 and m.forward and prepared is None and _crosses_pupil(element, system):
         o, state = _moved_before_surface(tracer, o, d, state, element, heights)
     hit = _intersection(tracer, m, o, d, heights, prepared)
     if state.power.dtype != tracer.dtype:  # the first intersection is always computed in float64
@@ -39,8 +39,8 @@ def meet(tracer, m, heights: Tensor | None) -> None:
         state, hit = state.to(tracer.dtype), SurfaceIntersection(t, gx, gy, hit.valid)
         o, d = (tuple(_cast(c, tracer.dtype) for c in v) for v in (o, d))
     m.hit = Hit(advance(o, d, hit.t), d, (hit.gx, hit.gy), hit.t)
-    on_surface = prepared is not None and state.sample is not None and _is_pupil(element, system)  # points of the same aperture
-    if not on_surface:
+    sampled_there = state.sample is not None and _is_pupil(element, system)
+    if prepared is None or not sampled_there:
         tracer.keep(state, _passed(element, m.hit, hit.valid))
     state.origin = to_global(element.pose, m.hit.local, state.datum)
     state.path = state.path + m.n_in * hit.t
@@ -61,6 +61,11 @@ def _at_pupil(system, m) -> bool:
     if m.index or not m.forward or not isinstance(z, float) or z + m.state.datum != pupil.z:
         return False
     return e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z) and _is_pupil(e, system)
+
+
+def _crosses_pupil(element, system) -> bool:
+    """Whether the first surface may cross the pupil, which is then its own aperture."""
+    return system.lit is None and not element.surface.flat
 
 
 def _is_pupil(element, system) -> bool:

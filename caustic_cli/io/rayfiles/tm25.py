@@ -113,6 +113,14 @@ def _header(data: bytes) -> _Header:
             f"counts {tables} spectral tables, {more} additional columns and {text} bytes of text; none may be"
             f" negative, and tables at most {MOST_TABLES:,}"
         )
+    columns = _columns(flags)
+    if spectrum == 2 and "wavelength" not in columns:
+        raise InputError("declares a wavelength for each ray, but has no column for it")
+    return _Header(lumens, watts, rays, spectrum, single, tables, more, text, columns)
+
+
+def _columns(flags: tuple[int, ...]) -> frozenset[str]:
+    """What the rays consist of; errors as of `parse`."""
     for name, flag in zip(COLUMNS, flags, strict=True):
         if flag not in (0, 1):
             raise InputError(f"has a {name} flag of {flag}; 0 or 1 is needed")
@@ -121,9 +129,7 @@ def _header(data: bytes) -> _Header:
         raise InputError("declares rays without position or direction; both are needed")
     if not {"radiant flux", "luminous flux"} & columns:
         raise InputError("declares rays with neither radiant nor luminous flux; one is needed")
-    if spectrum == 2 and "wavelength" not in columns:
-        raise InputError("declares a wavelength for each ray, but has no column for it")
-    return _Header(lumens, watts, rays, spectrum, single, tables, more, text, columns)
+    return columns
 
 
 def _after_tables(data: bytes, tables: int) -> int:
