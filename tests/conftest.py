@@ -7,6 +7,7 @@ from pathlib import Path
 from caustic_cli.cli import THREADS
 
 os.environ |= THREADS | os.environ  # as the command does, before a library reads them
+os.environ["CAUSTIC_EFFORT"] = "test"  # designs are small, here and in subprocesses, unless a test asks for more
 
 import pytest
 import torch

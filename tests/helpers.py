@@ -1,4 +1,4 @@
-"""What tests share: the picture they design for, small designs, a design that ends where it begins, and fewer combinations."""
+"""What tests share: the picture they design for, a design that ends where it begins, and fewer combinations."""
 
 from collections.abc import Sequence
 from itertools import combinations, product
@@ -6,11 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 from PIL import Image
-
-from caustic_cli.config import default_stages
-from caustic_cli.inverse import deconvolution, initial_surface
-from caustic_cli.kinds import OneSurface, lenslet_array
-from caustic_cli.studies import design_report
 
 
 def write_blob(name: str = "blob.png", size: int = 24, centre: tuple[float, float] = (8, 9), width: float = 30.0) -> None:
@@ -26,22 +21,6 @@ def begun(project, *_) -> SimpleNamespace:
     return SimpleNamespace(
         project=project, scene=None, field=None, heights=None, target=None, state=SimpleNamespace(heights=None), figures=figures
     )
-
-
-def small_designs(patch, rays: int, report: bool = False) -> None:
-    """For tests of what is done with a design: a first surface from 64 source cells across the lens in place of 256, and from 32
-    across a lenslet, fewer iterations for the least error, `rays` for the decision, and no report, whose drawing takes longer than
-    all the rest, unless asked for.
-
-    patch: pytest's monkeypatch."""
-    patch.setattr(default_stages, "LEAST_CELLS", 64)
-    patch.setattr(default_stages, "LEAST_CREASED", 64)
-    patch.setattr(lenslet_array, "LEAST_CELLS", 32)
-    patch.setattr(initial_surface, "FEW_CELLS", 32)
-    patch.setattr(deconvolution, "MOST_STEPS", 400)
-    patch.setattr(OneSurface, "final_rays", rays)
-    if not report:
-        patch.setattr(design_report, "write_report", lambda *args: None)
 
 
 def pairwise(*lists: Sequence) -> list[tuple]:

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 from PIL import Image
 from test_export import make, signed_volume
 from test_verify import NAMES, SOURCES, scene_with
@@ -227,7 +226,6 @@ def test_an_archive_holds_the_whole_scene(tmp_path, source, aperture):
 @pytest.mark.parametrize("options", ["--lens-size 8 --aperture circle --border 1", "--lens-size 12x8 --border 0.5 --mag 2"])
 def test_from_picture_to_files(tmp_path, monkeypatch, capfd, options):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 20_000)
     y, x = np.mgrid[0:24, 0:40]
     Image.fromarray((40 + 200 * np.exp(-((x - 14) ** 2 + (y - 9) ** 2) / 60.0)).astype(np.uint8)).save("wide.png")
     text = f"design wide.png --resolution 40 --quality draft --control 35 --rays 30000 --iterations 4 --json --quiet {options}"

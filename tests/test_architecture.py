@@ -18,7 +18,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 #: scene -> errors, with studies and exports beside the inverse problem.  They write files and pictures, through io, by which config
 #: reads project.toml.  The table of settings is data that stands below every room; the completion of all settings ends with that of
 #: the kind of design, and stands above both.
-BOTTOM = {"table", "errors", "loading"}
+BOTTOM = {"table", "errors", "loading", "effort"}
 ALLOWED = {
     "table": BOTTOM,
     "scene": {"scene"} | BOTTOM,
@@ -38,7 +38,7 @@ COMPLETION = "caustic_cli.config.completion"
 #: Only the command line may import the command line.
 TOP = {"cli", "__main__", "commands"}
 #: What the package's top level holds, besides the rooms.
-FRONT = {"__init__.py", "__main__.py", "cli.py", "errors.py", "loading.py"}
+FRONT = {"__init__.py", "__main__.py", "cli.py", "effort.py", "errors.py", "loading.py"}
 #: Files, formats and terminals: none of it below the command line's own modules.
 OUTSIDE = {"typer", "rich", "click", "PIL", "h5py", "tomli_w", "tomllib", "json", "csv", "argparse", "matplotlib"}
 

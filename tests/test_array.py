@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from PIL import Image
 from scipy.interpolate import BSpline
 
@@ -216,7 +216,6 @@ def arrays(tmp_path_factory):
     directory = tmp_path_factory.mktemp("arrays")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(directory)
-        small_designs(patch, 40_000)
         write_blob()
         sheet = np.zeros((48, 48), np.uint8)
         for i, j in itertools.product((0, 1), repeat=2):

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from rich.console import Console
 
 from caustic_cli import cli
@@ -17,7 +17,6 @@ from caustic_cli.commands.console import ConsoleReporter, ended_words
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.kinds import OneSurface
 from caustic_cli.project import checkpoint
-from caustic_cli.studies import design_report
 from caustic_cli.studies.radius import cost_of_radius
 from caustic_cli.workflow import design as workflow
 
@@ -45,8 +44,8 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     paint("blob.png", 5)
-    small_designs(monkeypatch, 5000, report=True)
-    monkeypatch.setattr(design_report, "write_report", lambda path, *rest: path.write_bytes(b"a report"))
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True")
+    monkeypatch.setattr("caustic_cli.studies.design_report.write_report", lambda path, *rest: path.write_bytes(b"a report"))
 
 
 def paint(name, centre):

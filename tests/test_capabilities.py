@@ -23,7 +23,20 @@ from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves.unsupported import WAVE_IMAGE
-from caustic_cli.scene import Component, Disc, FreeForm, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, SecondTarget
+from caustic_cli.scene import (
+    Component,
+    Disc,
+    FoldMirror,
+    FreeForm,
+    Lens,
+    Light,
+    Offset,
+    PlaneWave,
+    Points,
+    Scene,
+    Screen,
+    SecondTarget,
+)
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.screen import Sags
 from caustic_cli.scene.sources.distribution import Distribution
@@ -74,6 +87,7 @@ SCENES: dict[str, Scene] = {
     "two sides": replace(lens(entrance=FRONT), second_target=SecondTarget()),
     "designed entrance": lens(entrance=FRONT),
     "other elements": replace(PLAIN, elements=(Component(30.0, (20.0, 20.0)),)),
+    "folded axis": replace(PLAIN, elements=(FoldMirror(50.0, (60.0, 60.0), tilt=(45.0, 0.0)),)),
     "lenslet array": lens(array=(2, 1), control=(11, 8)),
     "circular aperture": lens(aperture="circle"),
     "absorption": lens(absorption=0.01),
@@ -164,7 +178,7 @@ def test_traits_are_those_of_the_scenes():
     assert not [name for name, trait in TRAITS.items() if trait.found_in(PLAIN)]
     assert not [name for name, scene in SCENES.items() if not TRAITS[name].found_in(scene)]
     known = {row.partition(" ")[0] for trait in TRAITS.values() for row in trait.settings}
-    assert known - {*TABLE} <= {"element", "source.also"}
+    assert known - {*TABLE} <= {"element", "element.reshapes", "source.also"}
 
 
 @pytest.mark.parametrize("name", CAPABILITIES)
@@ -201,7 +215,7 @@ def test_a_scene_is_refused_or_accepted_as_the_table_says(name, trait, tmp_path,
 
 def test_what_excludes_each_other_are_settings():
     rows = {entry.partition(" ")[0] for feature, others in (EXCLUDED | EXCLUDED_LATER).items() for entry in (feature, *others)}
-    assert rows - {*TABLE} <= {"element", "source.also"} and len(rows) > 20
+    assert rows - {*TABLE} <= {"element", "element.reshapes", "source.also"} and len(rows) > 20
 
 
 def test_the_guide_has_the_matrix_of_today():

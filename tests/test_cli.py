@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from PIL import Image
 
 from caustic_cli import __version__, cli
@@ -69,7 +69,7 @@ def designed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        small_designs(patch, 10_000, report=True)
+        patch.setenv("CAUSTIC_EFFORT", "test report=True")
         write_blob()
         text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet --lens-size 5 --throw 150"
         assert cli.run(shlex.split(text)) == 0
@@ -81,7 +81,6 @@ def here(designed, tmp_path, monkeypatch):
     folder = tmp_path / "here"
     shutil.copytree(designed, folder)
     monkeypatch.chdir(folder)
-    small_designs(monkeypatch, 10_000)
     return folder
 
 
@@ -359,7 +358,7 @@ def test_the_table_fits_a_terminal_and_any_encoding(monkeypatch, capfd, encoding
 
 
 def test_render_traces_the_rays_of_the_verdict_and_keeps_the_better_picture(here, capfd, monkeypatch):
-    monkeypatch.setattr("caustic_cli.workflow.lens.FINAL_RAYS", 200_000)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test final_rays=200000")
     picture = Path("blob.caustic/render.png")
     assert run("render blob.caustic --quiet --force", capfd)[0] == 0
     with Image.open(picture) as image:

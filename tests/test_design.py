@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import begun, small_designs
+from helpers import begun
 from PIL import Image
 
 from caustic_cli import cli
@@ -33,7 +33,6 @@ def _here(tmp_path, monkeypatch):
     y, x = np.mgrid[0:24, 0:24]
     light = 40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)
     Image.fromarray(light.astype(np.uint8)).save("blob.png")
-    small_designs(monkeypatch, 40_000)
 
 
 def design(capfd, *arguments, code=0) -> dict:
@@ -211,9 +210,6 @@ def test_threads_are_what_was_asked_for():
     program = f"""
 import torch
 from caustic_cli import cli
-from caustic_cli.kinds import OneSurface
-from caustic_cli.studies import design_report
-OneSurface.final_rays, design_report.write_report = 1000, lambda *args: None
 for name in "ab":
     assert cli.run(["design", "blob.png", *{TINY!r}, "--iterations", "3", "-o", name]) == 0
     assert torch.get_num_threads() == 1, torch.get_num_threads()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from PIL import Image
 from rayfiles import zemax
 from scipy.integrate import quad
@@ -288,7 +288,6 @@ def here(tmp_path, monkeypatch):
     Image.fromarray(np.array([[0, 255], [255, 255]], np.uint8)).save("die.png")
     Path("led.csv").write_text("angle,intensity\n0,1\n10,2\n60,0\n")
     Path("rays.dat").write_bytes(zemax(np.zeros((9, 3)), np.tile([0.0, 0.0, 1.0], (9, 1)), np.ones(9)))
-    small_designs(monkeypatch, 40_000)
 
 
 def run(capfd, *arguments, code=0):

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -43,9 +42,6 @@ def _here(tmp_path, monkeypatch):
     blob = (40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)
     Image.fromarray(blob).save("blob.png")
     Image.fromarray(np.stack([blob, blob // 2, blob[::-1]], -1)).save("rgb.png")
-    small_designs(monkeypatch, 20_000)
-    monkeypatch.setattr(study, "RAYS", 1000)
-    monkeypatch.setattr(study, "REPEATS", 1)
 
 
 def run(capfd, *arguments, code=0):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -9,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
+from helpers import begun
 from PIL import Image
+from rayfiles import cone_of, tm25
 
 from caustic_cli import cli, load
-from caustic_cli.config import default_stages
 from caustic_cli.errors import InputError
 from caustic_cli.export.bodies import CLOSE, bodies
 from caustic_cli.export.lighttools import write_lighttools
@@ -23,15 +24,18 @@ from caustic_cli.inverse.initial_surface import first_surface, sphere_net
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.schedule import LossImage
+from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import AxisSegment
+from caustic_cli.optics.misalignment import Misalignment, landing_points
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField, Sphere
 from caustic_cli.optics.system import EXIT, System, split_heights
 from caustic_cli.optics.trace import Tracer, expose, render
+from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.scene import Component, FoldMirror, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.retrace import retrace
 
@@ -140,6 +144,80 @@ def test_two_mirrors_make_a_periscope_whose_picture_is_upright():
     assert np.allclose(system.leg.at(0.0, 0.0, 300.0), [0.0, 100.0, 200.0])
     scene = replace(SCENE, elements=(mirror(100.0, (45.0, 0.0)), mirror(200.0, (-45.0, 0.0))))
     assert torch.allclose(expose(scene, FIELD, wavy(), rays).image, plain.image, atol=1e-12)
+
+
+TWO = mirror(90.0, (0.0, -50.0)), mirror(200.0, (40.0, 0.0))
+
+
+@pytest.mark.parametrize("elements", [(mirror(120.0, (45.0, 0.0), size=12.0),), TWO])
+@pytest.mark.parametrize("how", [{}, {"radius": (60.0, 60.0)}, {"tilt": (10.0, 20.0), "shift": (3.0, 1.0)}])
+def test_a_scene_seen_in_its_flat_mirrors_has_a_straight_axis_and_the_same_image(elements, how):
+    """Of light that misses a mirror, too: the first is smaller than the beam."""
+    folded = replace(SCENE, screen=replace(SCREEN, **how), elements=elements)
+    seen, rays = folded.unfolded, rays_of(SCENE, "stratified", 20_000, 1)
+    assert not seen.elements and System.of(seen, FIELD).leg is None
+    real, found = (expose(scene, FIELD, wavy(), rays, Filter("cosine", (3, 3))) for scene in (folded, seen))
+    assert torch.allclose(found.image, real.image, atol=1e-12 * float(real.image.max()))
+    assert found.lost == pytest.approx(real.lost, abs=1e-12)
+    assert (found.lost["missed_surface"] > 0.001) == (len(elements) == 1)
+    whole = Misalignment()
+    (real,) = landing_points(seen, FIELD, wavy(), rays, whole)
+    assert float(real.power.sum()) == pytest.approx(1.0 - found.lost["missed_surface"], abs=1e-12)
+
+
+def test_only_flat_mirrors_are_seen_through():
+    flat = mirror(90.0, (45.0, 0.0))
+    for element in (
+        thick(120.0, 25.0, thickness=6.0),
+        mirror(120.0, (45.0, 0.0), radius=-500.0),
+        replace(flat, z=120.0, free="front"),
+    ):
+        for elements in ((element,), (flat, element)):
+            scene = replace(SCENE, elements=elements)
+            assert scene.unfolded is scene
+
+
+@pytest.mark.parametrize(("tilt", "axis"), [((45.0, 0.0), 1), ((0.0, -50.0), 0)])
+def test_the_wave_image_behind_a_flat_mirror_is_that_of_the_straight_scene_mirrored(tilt, axis):
+    """As the image of its rays; with it the loss that a design reduces, and its derivative, by the mirrored picture."""
+    light, shift = Light(wavelengths=(550.0,), weights=(1.0,)), np.array([3.0, 1.0])
+    straight = replace(SCENE, light=light, screen=replace(SCREEN, shift=tuple(shift)))
+    turned = replace(SCREEN, shift=tuple(np.where(np.arange(2) == axis, -shift, shift)))
+    folded = replace(straight, screen=turned, elements=(mirror(120.0, tilt),))
+    one, other = (wave_image(scene, FIELD, wavy()).image for scene in (straight, folded))
+    assert torch.allclose(other.flip(axis), one, atol=1e-5 * float(one.max()))
+    rays = expose(folded, FIELD, wavy(), rays_of(SCENE, "stratified", 200_000, 1)).image
+    assert float((other - rays).norm() / rays.norm()) < 0.03
+    assert float((other.flip(axis) - rays).norm() / rays.norm()) > 0.5
+    goal = torch.rand(PIXELS, PIXELS, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    losses = [
+        WaveObjective(scene, FIELD, wavy(), picture, "rms", dtype=torch.float64)(wavy(0.0501))
+        for scene, picture in ((straight, goal), (folded, goal.flip(axis)))
+    ]
+    assert losses[1].loss == pytest.approx(losses[0].loss, rel=1e-6)
+    first, second = (evaluation.gradients[EXIT] for evaluation in losses)
+    assert float((first - second).norm()) < 1e-4 * float(first.norm())
+
+
+def test_a_mirror_that_the_beam_exceeds_cuts_the_wave_image_as_it_cuts_the_rays():
+    light = Light(wavelengths=(550.0,), weights=(1.0,))
+    folded = replace(SCENE, light=light, elements=(mirror(120.0, (45.0, 0.0), size=12.0),))
+    waves = wave_image(folded, FIELD, wavy())
+    rays = expose(folded, FIELD, wavy(), rays_of(SCENE, "stratified", 200_000, 1))
+    assert 1.0 - waves.leaving == pytest.approx(rays.lost["missed_surface"], rel=0.05) and rays.lost["missed_surface"] > 0.02
+    assert float((waves.image - rays.image).norm() / rays.image.norm()) < 0.05
+
+
+def test_errors_displace_the_image_behind_a_flat_mirror_as_that_of_the_straight_scene():
+    errors = Misalignment(throw=2.0, lens_shift=(0.1, 0.2), lens_tilt=(0.3, 0.1), screen_shift=(0.4, 0.5), screen_tilt=(1.0, 2.0))
+    rays = rays_of(SCENE, "stratified", 4_000, 1)
+    folded = replace(SCENE, elements=(mirror(120.0, (45.0, 0.0)),)).unfolded
+    (found,) = landing_points(folded, FIELD, wavy(), rays, errors)
+    mirrored = replace(errors, screen_shift=(0.4, -0.5), screen_tilt=(-1.0, 2.0))
+    (straight,) = landing_points(SCENE, FIELD, wavy(), rays, mirrored)
+    assert torch.allclose(found.x, straight.x, atol=1e-9) and torch.allclose(found.y, -straight.y, atol=1e-9)
+    near = errors.upright(folded).screen
+    assert near.shift[1] == pytest.approx(-mirrored.upright(SCENE).screen.shift[1], abs=1e-9) and near.mirrored == (False, True)
 
 
 def test_a_folded_axis_is_that_of_the_reflected_ray():
@@ -312,7 +390,7 @@ def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
 @pytest.fixture
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 200_000, report=True)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True final_rays=200000")
     light = picture()
     Image.fromarray((255 * light / light.max()).astype(np.uint8).T[::-1]).save("one.png")
 
@@ -357,6 +435,35 @@ def test_design_render_resume_and_files(_here, capfd):
     assert "single lens" in run(capfd, "export", "p", "--format", "zemax", code=2)
 
 
+def test_a_flat_mirror_excludes_nothing_that_a_lens_has_by_itself(_here, capfd):
+    """Neither page, report, tolerances, a grid for Zemax, studies, ray files nor designs that are robust or on the wave image; a
+    curved mirror does."""
+    flat, curved = ("--element", "mirror z=150 tilt=45,0"), ("--element", "mirror z=150 tilt=45,0 radius=-2000")
+    Path("t.toml").write_text("[index]\nsigma = 0.001\n")
+    Path("led.tm25ray").write_bytes(tm25(*cone_of(20_000, 8.0, seed=1)))
+    led = ("--source", "rays", "--source-file", "led.tm25ray", "--source-position", "0,0,-40")
+    made = run(capfd, "design", "one.png", *SMALL, *led, *flat, "--iterations", "2", "-o", "led")
+    assert made["relative_rms"] < 0.6 and made["on_screen"] > 0.7
+    assert "cannot be combined" in run(capfd, "design", "one.png", *SMALL, *led, *curved, "-o", "no", code=2)
+    run(capfd, "design", "one.png", *SMALL, "--robust", "t.toml", *flat, "--iterations", "2", "-o", "robust")
+    made = run(capfd, "design", "one.png", *SMALL, "--waves", "off", *flat, "--iterations", "2", "-o", "p")
+    asked = ("--report", "--tolerances", "t.toml", "--html", "page.html", "--rays", "20000", "--effects", "fresnel")
+    said = run(capfd, "render", "p", *asked, "--quiet", "--json")
+    assert said["tolerances"]["nominal"]["relative_rms"] == pytest.approx(made["relative_rms"], rel=0.1) and said["report"]
+    page = Path("page.html").read_text()
+    assert "the edges of the mirrors" in page
+    assert json.loads(re.search(r'"axes":(\[\[.*?\]\])', page)[1]) == [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
+    load("p").export("lens.dat")
+    assert "flat mirrors fold" in Path("lens.dat").read_text()
+    study = run(capfd, "convergence", "p", "--study", "intersection", "--repeats", "1", "--rays", "500", "--quiet", "--json")
+    assert study
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("caustic_cli.workflow.design._run", begun)
+        assert cli.run(["design", "one.png", *SMALL[:3], "--waves", "on", *flat, "--quiet", "-o", "w"]) == 0
+    assert any(stage.get("waves") for stage in tomllib.loads(Path("w/project.toml").read_text())["design"]["stages"])
+    assert "--waves on cannot be" in run(capfd, "design", "one.png", *SMALL, "--waves", "on", *curved, "-o", "no", code=2)
+
+
 def test_an_archive_holds_the_glass_of_every_lens(tmp_path):
     """Whose index is another at each wavelength; one of them is given by its index."""
     lens = Lens((10.0, 10.0), control=(6, 6), glass="N-BK7", index=1.5168, offset=Offset(4.0))
@@ -392,7 +499,7 @@ def test_what_other_elements_exclude_is_named_as_it_was_given(_here, capfd, opti
 
 
 def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):
-    monkeypatch.setattr(default_stages, "LEAST_CELLS", 256)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test final_rays=200000 source_cells=256")
     beside = ("--element", "lens z=60 thickness=6 radius=150,-150 index=1.5 size=26 free=both")
     fixed = ("--element", beside[1].removesuffix(" free=both"))
     one = run(capfd, "design", "one.png", *SMALL, *fixed, "--iterations", "8", "-o", "one")

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -88,7 +87,7 @@ def test_light_lost_beside_the_screen_is_accounted_for():
 def test_a_picture_of_dots_has_its_light_however_soon_the_bound_is_tight():
     target = np.zeros((48, 48))
     target[8::16, 8::16] = 1.0
-    found = deconvolved(target, spread(1.5))
+    found = deconvolved(target, spread(1.5), 300)
     assert found.light.shape == tuple(48 + 2 * n for n in found.beside) and found.bound > 0.9 * found.error
 
 
@@ -360,7 +359,7 @@ def test_the_middle_shines_into_the_cone_of_the_whole():
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Image.fromarray((disc_on(32, 0.7) * 255).astype(np.uint8)).save("blob.png")
-    small_designs(monkeypatch, 200_000)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test final_rays=200000")
 
 
 def design(capfd, *arguments) -> dict:

@@ -368,9 +368,8 @@ KIND = Addition(
     from pathlib import Path
     import numpy as np
     from caustic_cli import cli
-    from caustic_cli.kinds import OneSurface, problem_of
+    from caustic_cli.kinds import problem_of
     from caustic_cli.project.project import Project
-    OneSurface.final_rays = 2000
     np.save("picture.npy", np.outer(np.arange(1.0, 9.0), np.ones(8)))
     Path("two.toml").write_text("[design]\\nfarther = 400.0")
     small = ("--resolution", "8", "--control", "6", "--start", "offset", "--rays", "200", "--iterations", "3", "--waves", "off")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 
 from caustic_cli import cli, load
 from caustic_cli.inverse.gradient_index import design_gradient_index, plate_system
@@ -32,7 +32,6 @@ TINY = ("--resolution", "24", "--iterations", "3", "--threads", "1", "--quiet")
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 40_000)
     write_blob()
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -70,7 +69,6 @@ def home(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in SMALL.items():
             patch.setenv(name, value)
-        small_designs(patch, 20_000)
         os.chdir(directory)
         for name in ("flame.png", "ball.png", "array-sheet.png", "array-wanted.png"):
             shutil.copy(ROOT / "examples" / name, directory)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import small_designs, write_blob
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
@@ -18,7 +18,6 @@ from caustic_cli.errors import InputError
 from caustic_cli.io.archive import open_archive
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
-from caustic_cli.studies import design_report
 from caustic_cli.studies.design_report import write_report
 from caustic_cli.studies.irradiance import irradiance_figures, per_part, unit_figures
 
@@ -50,7 +49,6 @@ BAD = [
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    small_designs(monkeypatch, 40_000)
 
 
 def run(capfd, *arguments, code=0):
@@ -157,7 +155,7 @@ def test_the_table_and_the_report_say_it_too(capfd, monkeypatch):
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     bars, plain = [], Figure.colorbar
-    monkeypatch.setattr(design_report, "write_report", write_report)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True")
 
     def colorbar(figure, drawn, **options):
         norm = drawn.norm

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import begun, small_designs
+from helpers import begun
 
 import caustic_cli
 from caustic_cli import cli, design, load, render, trace
@@ -26,7 +26,6 @@ SMALL = {"lens": {"size": [2.0, 2.0]}, "screen": {"z": 60.0, "resolution": [32, 
 @pytest.fixture(autouse=True)
 def _quick(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 40_000)
 
 
 def picture() -> np.ndarray:
@@ -37,9 +36,7 @@ def picture() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def lens():
-    with pytest.MonkeyPatch.context() as patch:
-        small_designs(patch, 40_000)
-        return design(picture(), mag=2, settings=SMALL, quality="draft", waves="off")
+    return design(picture(), mag=2, settings=SMALL, quality="draft", waves="off")
 
 
 def test_nothing_is_written_unless_asked(lens, tmp_path):

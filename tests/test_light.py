@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -237,7 +236,6 @@ def test_the_objective_knows_the_light_on_the_lens(source):
 
 def test_study_of_light(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 40_000)
     monkeypatch.setattr(tradeoff, "PARTS", (1.0, 1.8))
     monkeypatch.setattr(tradeoff, "NEAR_WEIGHTS", (0.0, 10.0))
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
@@ -286,7 +284,6 @@ def test_study_of_light(tmp_path, monkeypatch, capfd):
 
 def test_study_of_light_from_infinity_varies_the_weight_alone(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 40_000)
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
     assert (
         cli.run(

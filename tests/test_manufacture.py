@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 from PIL import Image
 from scipy.optimize import brentq
 from test_export import make
@@ -23,7 +22,6 @@ from caustic_cli.optics import curvature
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.studies import manufacture as manufacture_module
 from caustic_cli.studies.manufacture import manufacture, preview, wall_and_stock
 
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
@@ -42,11 +40,6 @@ def surface(shape, control=(40, 34), size=(10.0, 8.0), source=None, fresnel="exa
 def bowl(radius, centre=(0.0, 0.0)):
     """The inside of a sphere, concave towards the screen."""
     return lambda x, y: 3.0 + radius - torch.sqrt(radius**2 - (x - centre[0]) ** 2 - (y - centre[1]) ** 2)
-
-
-@pytest.fixture(autouse=True)
-def _few_rays(monkeypatch):
-    monkeypatch.setattr(manufacture_module, "RAYS", 10_000)
 
 
 # curvature
@@ -164,7 +157,6 @@ def test_the_penalty_of_a_radius(radius, rough):
 def test_a_designed_lens_obeys_its_limits(tmp_path, monkeypatch, capfd):
     """At 2e5 points, where the same design without limits does not."""
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 10_000)
     y, x = np.mgrid[0:24, 0:24]
     Image.fromarray(np.where((x - 9) ** 2 + (y - 13) ** 2 < 34, 255, 60).astype(np.uint8)).save("dot.png")
     base = "design dot.png --resolution 24 --quality draft --control 35 --rays 20000 --iterations 3 --quiet "

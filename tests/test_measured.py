@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from rayfiles import cone_of, lighttools, tm25, zemax
 from test_emission import LENS, heights, scene
 
@@ -212,7 +212,6 @@ def test_impossible_ones_are_refused(what, message):
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    small_designs(monkeypatch, 40_000)
 
 
 def run(capfd, *arguments, code=0):

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -29,7 +28,7 @@ BASE = "--resolution 24 --quality draft --control 35 --rays 20000 --iterations 3
 def here(tmp_path, monkeypatch):
     """Two islands of light: between them, the surface has a crease."""
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 60_000)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test final_rays=60000")
     y, x = np.mgrid[:48, :48]
     islands = (np.hypot(x - 12, y - 20) < 9) | (np.hypot(x - 36, y - 28) < 9)
     Image.fromarray(np.where(islands, 255, 0).astype(np.uint8)).save("islands.png")

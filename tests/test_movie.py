@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from PIL import Image
 
 from caustic_cli import cli, design
@@ -24,7 +24,6 @@ SMALL = ["--resolution", "24", "--waves", "off", "--threads", "1", "--quiet"]
 @pytest.fixture
 def small(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 20_000)
     write_blob()
 
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
@@ -172,7 +172,6 @@ def test_sobol_points_do_not_depend_on_where_a_draw_begins():
 
 def test_design_and_render_of_a_disc_say_their_noise(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 40_000)
     write_blob()
     common = ["--threads", "1", "--json"]
     assert (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import small_designs, write_blob
+from helpers import write_blob
 
 from caustic_cli import cli, load
 from caustic_cli.errors import InputError
@@ -174,7 +174,6 @@ SMALL = ["--resolution", "24", "--control", "12", "--rays", "4000", "--iteration
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 10_000)
     write_blob("blob.png")
 
 

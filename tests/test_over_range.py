@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from PIL import Image
 
 from caustic_cli import cli
@@ -39,7 +39,6 @@ THROWS = Ranges((Range("throw", 250.0, 350.0),))
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    small_designs(monkeypatch, 40_000)
 
 
 def run(capfd, *arguments, code=0) -> dict:
@@ -370,7 +369,6 @@ def few(monkeypatch):
         monkeypatch.setattr(grid, name, values)
     monkeypatch.setattr(grid, "PIXELS", 16)
     monkeypatch.setattr(grid, "CONTROL", 9)
-    monkeypatch.setattr(architectures, "ROUNDS", (3, 6))
 
 
 def test_the_grid_is_trained_alike_and_repeats(few, tmp_path):

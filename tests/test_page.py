@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from rayfiles import cone_of, tm25
 
 from caustic_cli import cli, load
@@ -44,7 +44,6 @@ def home(tmp_path_factory):
     directory = tmp_path_factory.mktemp("page")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(directory)
-        small_designs(patch, 20_000)
         write_blob()
         small = ["--resolution", "64", "--iterations", "3", "--waves", "off", "--threads", "1", "--quiet"]
         for name, given in DESIGNS.items():

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from PIL import Image, ImageDraw
 
 from caustic_cli import cli, design
@@ -25,7 +25,6 @@ SMALL = ["--resolution", "32", "--control", "20", "--rays", "4000", "--iteration
 @pytest.fixture(autouse=True)
 def _quick(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 10_000)
 
 
 @pytest.mark.parametrize("name", presets.names())

@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -44,12 +43,10 @@ def designed(tmp_path_factory):
     x = np.arange(20)
     np.save(folder / "blob.npy", np.exp(-((x[:, None] - 6) ** 2 + (x - 12) ** 2) / 20.0) + 0.1)
     (folder / "c.toml").write_text(CONFIG)
-    with pytest.MonkeyPatch.context() as patch:
-        small_designs(patch, 10_000)
-        begun = workflow.prepare(
-            folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=Reporter(quiet=True)
-        )
-        workflow.design(begun, "cpu", Reporter(quiet=True), 0.0)
+    begun = workflow.prepare(
+        folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=Reporter(quiet=True)
+    )
+    workflow.design(begun, "cpu", Reporter(quiet=True), 0.0)
     return begun.project.path
 
 
@@ -331,7 +328,6 @@ def test_finished_where_every_image_stands_that_was_made(copy, results):
 def test_a_profile_weights_the_light(designed, tmp_path, monkeypatch, capfd):
     """Only the aperture's +x half shines, so light arrives on that side only, and all of it is accounted for."""
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 10_000)
     profile = np.zeros((4, 3))
     profile[2:] = 1.0
     np.save("half.npy", profile)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.inverse import ranks
@@ -21,9 +21,6 @@ DRIVER = """
 import sys
 from caustic_cli import cli
 from caustic_cli.workflow import design as workflow
-from caustic_cli.kinds import OneSurface
-from caustic_cli.studies import design_report
-OneSurface.final_rays, design_report.write_report = 5000, lambda *args: None
 sys.exit(cli.run(["design", "blob.png", "--config", "c.toml", "--quiet", "--threads", "1", "-o", "two"]))
 """
 #: Both ways of emitting rays; 12 iterations of L-BFGS, whose line searches ask for more evaluations than that.
@@ -53,7 +50,6 @@ tolerance = 0.0
 def test_two_ranks_design_what_one_process_does(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
-    small_designs(monkeypatch, 5000)
     write_blob("blob.png", 16, (5, 6), 15.0)
     Path("c.toml").write_text(CONFIG)
     Path("two.py").write_text(DRIVER)

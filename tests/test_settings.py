@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from caustic_cli.config.default_stages import GAPS, transport_cells
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, Settings, build_lens, build_scene, dump, parse, tables_of
 from caustic_cli.config.table import Parameters
+from caustic_cli.effort import FINE, STANDARD, TEST, current_effort
 from caustic_cli.errors import InputError
 
 INDEX = 1.5443  # table D.2
@@ -221,6 +223,16 @@ def test_glass_replaces_the_index():
 
 OFFSET = {"design": {"start": "offset", "waves": "off"}}
 RAYS = {"design": {"waves": "off"}}
+
+
+def test_the_environment_gives_the_effort_that_no_quality_sets(monkeypatch):
+    assert current_effort() == TEST
+    monkeypatch.setenv("CAUSTIC_EFFORT", "fine report=False wave_iterations=(3,)")
+    assert current_effort() == replace(FINE, report=False, wave_iterations=(3,))
+    asked, plain = (complete(OFFSET, 1.0, by).design.stages for by in (Parameters(quality="draft"), None))
+    assert [stages[-1].iterations for stages in (asked, plain)] == [25, 120]
+    monkeypatch.delenv("CAUSTIC_EFFORT")
+    assert current_effort() == STANDARD
 
 
 @pytest.mark.parametrize(("quality", "first", "last"), [("draft", 15, 25), ("standard", 25, 50), ("fine", 40, 120)])

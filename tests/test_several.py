@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from rayfiles import cone_of, zemax
 from test_emission import LENS, heights
 
@@ -17,6 +17,9 @@ from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
+from caustic_cli.export.lighttools import write_lighttools
+from caustic_cli.export.supported import refuse
+from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.measured import coarse_words
@@ -147,7 +150,6 @@ def test_settings_go_round():
 def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    small_designs(monkeypatch, 40_000)
     Path("led.dat").write_bytes(zemax(*cone_of(20_000, 12.0)))
     Path("led.csv").write_text("0,1\n30,0.5\n")
     Path("two.toml").write_text(
@@ -187,6 +189,29 @@ def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     assert json.loads(capfd.readouterr().out)["maps"][0]["check"]["relative_error"] < 1e-4
     Path("two.toml").write_text("[[source]]\n[[source]]\ntype = 'point'\n")
     assert "--waves on needs one source" in run(*base, "-o", "c.caustic", "--waves", "on", code=2)
+
+
+@pytest.mark.parametrize("spectra", [(NONE,) * 5, tuple(((450.0 + 20.0 * k, 650.0), (1.0, 0.5 + k)) for k in range(5))])
+def test_an_archive_holds_all_of_them(tmp_path, spectra):
+    """With power, place, intensity and light of each; the rays of a file are given again."""
+    light = Light(None, *(tuple(c for one in spectra for c in one[k]) for k in (0, 1)))
+    here = Scene(Several(MEMBERS, spectra), LENS, SCREEN, light)
+    field, z = HeightField.of(LENS), heights(LENS)
+    write_lighttools(tmp_path / "a.npz", here, field, z)
+    there, *lens = open_archive(tmp_path / "a.npz", MEMBERS[3].rays)
+    assert [m.kind for m in there.source.members] == [m.kind for m in MEMBERS]
+    assert there.source.fractions == pytest.approx(here.source.fractions, rel=1e-15)
+    assert [s[0] for s in there.source.spectra] == [s[0] for s in spectra] and len(there.bands) == len(here.bands)
+    assert [b.weight for b in there.bands] == pytest.approx([b.weight for b in here.bands], rel=1e-14)
+    one, other = (expose(s, *of, rays_of(s, "grid", 40_000)).image for s, *of in ((here, field, z), (there, *lens)))
+    torch.testing.assert_close(other, one, rtol=0, atol=1e-12)
+    with pytest.raises(InputError, match="source 4: its source is a ray file"):
+        open_archive(tmp_path / "a.npz")
+    with pytest.raises(InputError, match="builds one source"):
+        refuse(Scene(Several(MEMBERS[:2], (NONE,) * 2), LENS, SCREEN), "lighttools", script=True, mould=False)
+    write_lighttools(tmp_path / "b.npz", replace(here, source=Several(MEMBERS[:2], spectra[:2])), field, z)
+    with pytest.raises(InputError, match="none of this one's is"):
+        open_archive(tmp_path / "b.npz", MEMBERS[3].rays)
 
 
 def test_a_wave_image_names_the_wavelengths_of_all_sources():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import small_designs, write_blob
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.config import settings
@@ -53,7 +53,6 @@ iterations = 4
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    small_designs(monkeypatch, 40_000)
 
 
 def run(capfd, *arguments, code=0):

@@ -10,7 +10,7 @@ import misaligned
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs, write_blob
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.config import tolerances as schema
@@ -417,7 +417,6 @@ def test_the_loss_over_draws_and_its_gradient():
 def test_a_robust_design_and_its_study(tmp_path, monkeypatch, capsys):
     """The file is kept in the project; the study is written, and not done twice; the last stage's loss is over draws."""
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 20_000)
     write_blob()
     Path("errors.toml").write_text(
         "draws = 12\n[throw]\nsigma = 4\n[screen_shift]\nsigma = [0.3, 0]\n[form_error]\nrms = 1e-5\nshortest = 4\n"

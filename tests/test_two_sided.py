@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import begun, small_designs
+from helpers import begun
 from PIL import Image
 
 from caustic_cli import cli, load
@@ -141,7 +141,7 @@ def test_a_designed_entrance_traces_as_the_free_one():
 @pytest.fixture
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 100_000, report=True)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True final_rays=100000")
     for name, light in (("one", ONE), ("two", TWO)):
         Image.fromarray((255 * light / light.max()).astype(np.uint8).T[::-1]).save(f"{name}.png")
 

@@ -2,11 +2,17 @@
 
 import importlib.util
 import json
+import re
 import shlex
+import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+from scipy.spatial.transform import Rotation
 from test_export import make
 
 from caustic_cli import cli
@@ -14,8 +20,12 @@ from caustic_cli.errors import CausticError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Disc, PlaneWave, Points, Scene, Screen
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.receiver import Receiver
+from caustic_cli.optics.screen_shape import points_in_space
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
+from caustic_cli.scene import Disc, Light, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import verify
 
 RAYS = 400_000
@@ -114,6 +124,104 @@ def test_other_reflections_are_refused(monkeypatch):
     assert "fresnel" in verify.unsupported(replace(scene, lens=replace(scene.lens, fresnel="none")))
 
 
+class InItsPlace:
+    """Mitsuba's part of the comparison by this program's own trace, of the scenes that are written for it: what is compared is then
+    how they are placed, indexed, weighted and binned."""
+
+    __version__, LogLevel = "none", SimpleNamespace(Error=0)
+
+    def __init__(self, scene, field, heights):
+        self.lens, self.indices = (scene, field, heights), []
+
+    def set_log_level(self, level):
+        pass
+
+    def variant(self):
+        return "llvm"
+
+    def load_file(self, path, optimize):
+        text = Path(path).read_text()
+        index = re.search(r'int_ior" value="([^"]+)"', text)
+        self.indices += [float(index[1])] if index else []
+        return SimpleNamespace(shapes=list, index=float(index[1]) if index else None)
+
+    def follow(self, _mi, world, _shapes, surfaces, start, direction):
+        scene, field, heights = self.lens
+        scene = scene if world.index is None else replace(scene, lens=replace(scene.lens, index=world.index, glass=None))
+        assert surfaces[-1][0] == "screen" and [name for name, _ in surfaces[:-1]] == (
+            ["mirror"] if scene.lens.mirror else [e.name for e in System.of(scene).elements]
+        )
+        system = System.of(scene, field)
+        ends = [torch.from_numpy(np.ascontiguousarray(c)) for c in (*start, *direction)]
+        rays = RayState(tuple(ends[:3]), tuple(ends[3:]), torch.ones(len(ends[0]), dtype=torch.float64))
+        (out,) = Tracer(system, rays)({EXIT: heights})
+        out = out.expanded()
+        receiver = Receiver.of(system, scene.screen)
+        o, d = (np.stack([c.numpy() for c in v]) for v in ((*out.origin[:2], out.origin[2] + out.datum), out.direction))
+        normal = np.array(receiver.axes[2])
+        t = (np.array(receiver.middle) @ normal - normal @ o) / (normal @ d)
+        return *(o + t * d), np.where(t > 0, out.power.numpy(), 0.0)
+
+
+def leaning(scene):
+    return replace(scene, screen=replace(scene.screen, tilt=(12.0, -20.0), shift=(3.0, 1.5)))
+
+
+def reflecting(scene):
+    return replace(scene, lens=replace(scene.lens, mirror=True), screen=replace(scene.screen, z=-300.0, size=(60.0, 50.0)))
+
+
+def dispersing(scene):
+    light = Light(wavelengths=(450.0, 550.0, 650.0), weights=(1.0, 2.0, 1.0))
+    return replace(scene, lens=replace(scene.lens, glass="N-SF11", index=1.78), light=light)
+
+
+@pytest.mark.parametrize("how", [leaning, reflecting, dispersing, lambda scene: leaning(dispersing(scene))])
+def test_scenes_are_written_and_compared_as_they_are(how, tmp_path, monkeypatch):
+    """Tilted and shifted screens, mirrors and several wavelengths, by a trace in place of Mitsuba's; a lens that leans differs."""
+    scene, field, heights = scene_with(PlaneWave())
+    scene = how(scene)
+    monkeypatch.setattr(verify, "find_spec", lambda name: True)
+    assert not verify.unsupported(scene)
+    other = InItsPlace(scene, field, heights)
+    monkeypatch.setitem(sys.modules, "mitsuba", other)
+    monkeypatch.setattr(verify, "_choose_variant", lambda: "none")
+    monkeypatch.setattr(verify, "_follow", other.follow)
+    paths = [tmp_path / f"{k}.xml" for k in range(len(scene.bands))]
+    for path, band in zip(paths, scene.bands, strict=True):
+        write_mitsuba(path, band.scene, field, heights, (17, 17), dark=True)
+    found = verify.verify(paths, scene, field, heights, RAYS)
+    assert found.agree, found.figures
+    if not scene.lens.mirror:
+        assert other.indices == pytest.approx([band.scene.lens.index for band in scene.bands], rel=1e-6)
+    other.lens = scene, field, heights + 0.01 * field.control_xy()[0][:, None]
+    assert not verify.verify(paths, scene, field, heights, RAYS).agree
+
+
+def test_a_leaning_screen_is_written_as_it_leans(tmp_path):
+    """Its corners by the transformations of the file, one after the other, are those of the screen."""
+    scene, field, heights = scene_with(PlaneWave())
+    scene = leaning(scene)
+    write_mitsuba(tmp_path / "a.xml", scene, field, heights, (17, 17), dark=True)
+    text = (tmp_path / "a.xml").read_text()
+    steps = re.search(r'id="screen">.*?<transform name="to_world">(.*?)</transform>', text, re.S)[1]
+    points = np.array([(x, y, 0.0) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+    for kind, rest in re.findall(r"<(\w+) (.*?)/>", steps):
+        v = {key: float(value) for key, value in re.findall(r'(\w+)="([^"]+)"', rest)}
+        if kind == "scale":
+            points = points * [v.get("x", 1.0), v.get("y", 1.0), v.get("z", 1.0)]
+        elif kind == "translate":
+            points = points + np.array([v.get("x", 0.0), v.get("y", 0.0), v.get("z", 0.0)])
+        else:
+            axis = [v.get("x", 0.0), v.get("y", 0.0), v.get("z", 0.0)]
+            points = Rotation.from_rotvec(np.radians(v["angle"]) * np.array(axis)).apply(points)
+    hx, hy = scene.screen.half_size
+    x, y = (c.ravel() for c in np.meshgrid([-hx, hx], [-hy, hy], indexing="ij"))
+    wanted = np.stack(points_in_space(scene.screen, x, y), -1)
+    order = [np.lexsort(np.round(p, 6).T) for p in (points, wanted)]
+    assert np.allclose(points[order[0]], wanted[order[1]], atol=1e-6)
+
+
 # Mitsuba itself
 
 
@@ -133,7 +241,7 @@ def mitsuba():
 def test_mitsuba_agrees(mitsuba, tmp_path, source, capsys):
     scene, field, heights = scene_with(source)
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (129, 129), dark=True)
-    decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, RAYS // 2)
+    decision = verify.verify([tmp_path / "lens.xml"], scene, field, heights, RAYS // 2)
     with capsys.disabled():
         print(
             f"\n  {source.kind if hasattr(source, 'kind') else 'plane'}: mean Z^2 {decision.figures['z_mean_square']:.3f},"
@@ -150,7 +258,7 @@ def test_mitsuba_notices_another_index(mitsuba, tmp_path):
     scene, field, heights = scene_with(PlaneWave())
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (129, 129), dark=True)
     other = replace(scene, lens=replace(scene.lens, index=scene.lens.index + 0.01))
-    assert not verify.verify(tmp_path / "lens.xml", other, field, heights, RAYS).agree
+    assert not verify.verify([tmp_path / "lens.xml"], other, field, heights, RAYS).agree
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -11,15 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import begun, small_designs
+from helpers import begun
 from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
 from caustic_cli.config import completion
-from caustic_cli.config.default_stages import LEAST_WAVES, WAVES, wave_refinement
+from caustic_cli.config.default_stages import LEAST_WAVES, wave_refinement
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import build_scene
+from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.schedule import LossImage
@@ -66,7 +67,6 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[-1:1:32j, -1:1:32j]
     Image.fromarray(((np.hypot(x, y) < 0.7) * 255).astype(np.uint8)).save("blob.png")
-    small_designs(monkeypatch, 40_000)
 
 
 def design(capfd, *arguments, code=0) -> dict | str:
@@ -177,7 +177,7 @@ def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
     design(capfd, "blob.png", *small, *extra, "-o", "p")
     tables = workflow.Project.open("p").settings.design.stages
     assert any(t.waves for t in tables) == stages
-    assert not stages or [len(t.waves) for t in tables if t.waves] == [WAVES["standard"][0]] * len(WAVES["standard"][1])
+    assert not stages or [len(t.waves) for t in tables if t.waves] == [STANDARD.wave_colours] * len(STANDARD.wave_iterations)
 
 
 OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"
@@ -238,9 +238,9 @@ def test_a_design_on_waves_alone_has_no_rays_to_compare_others_on():
 
 
 def test_time_bounds_the_stages():
-    assert wave_refinement(1e6, 0) == [(5, n) for n in WAVES["standard"][1]]
+    assert wave_refinement(1e6, 0) == [(5, n) for n in STANDARD.wave_iterations]
     fewer = wave_refinement(1e7, 0)
-    assert 0 < sum(n for _, n in fewer) < sum(WAVES["standard"][1]) and all(n >= LEAST_WAVES for _, n in fewer)
+    assert 0 < sum(n for _, n in fewer) < sum(STANDARD.wave_iterations) and all(n >= LEAST_WAVES for _, n in fewer)
     assert wave_refinement(1e9, 0) == [] and len(wave_refinement(1e9, 0, timed=False)) == 2
     with pytest.raises(InputError, match="waves"):
         completion.complete({"design": {"waves": "perhaps"}}, 1.0)

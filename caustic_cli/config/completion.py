@@ -82,8 +82,6 @@ def complete(
 def _aspect_of_a_sheet(s: Settings, aspect: float) -> float:
     """Height over width of each picture of a contact sheet."""
     array = check("lens.array", s.lens.array)
-    if max(array) == 1 or s.target.color:
-        raise InputError("⟨target.sheet⟩ needs ⟨+lens.array⟩, and a picture without colours")
     return aspect * array[0] / array[1]
 
 

@@ -1,4 +1,4 @@
-"""Settings that exclude each other, and why: one table."""
+"""Settings that exclude or need each other, and why."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ def _by_settings(capability: Capability) -> dict[str, str]:
     return {entry: message for trait, message in capability.unsupported.items() for entry in TRAITS[trait].settings}
 
 
+_SHEET = "⟨target.sheet⟩ needs ⟨+lens.array⟩, and a picture without colours"
 _LENSLETS = (
     "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none and optimizer"
     " lbfgs"
@@ -28,16 +29,21 @@ _TWO_SIDES = {
     "design.waves on": WAVE_REFINEMENT.unsupported["two sides"],
 }
 
+_BOTH = "⟨{feature}⟩ and ⟨{path}⟩ both define the light behind the picture: give one of them"
+_SECOND = (("second.file", "second.collimate", "second.focus"), ("second.collimate", "second.focus"), ("second.focus",))
+
 #: Feature -> settings that exclude it -> message.  Both are settings with any value but the default, or with one.  In messages
 #: {path} and {value} are those of the setting, {said} both of them, or the path of a flag alone, {default} its default, and
 #: {feature} the feature.
 EXCLUDED: dict[str, dict[str, str]] = {
+    "target.sheet": {"target.color": _SHEET},
     "target.color": {"source.also": "[[source]] of a coloured picture must be one, whose three wavelengths are its colours"},
-    **dict.fromkeys(TRAITS["two sides"].settings, _TWO_SIDES),
+    **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
     "element": {
         **dict.fromkeys(TRAITS["two sides"].settings, "⟨{path}⟩" + NOT_BESIDE),
-        **dict.fromkeys(("design.robust", "design.waves on", "lens.gradient"), "{said}" + NOT_BESIDE),
+        "lens.gradient": "{said}" + NOT_BESIDE,
     },
+    "element.reshapes": dict.fromkeys(("design.robust", "design.waves on"), "{said}" + NOT_BESIDE),
     "element.free": dict.fromkeys(
         ("design.network", "design.optimizer", "target.color"),
         "{said} cannot be combined with ⟨element.free⟩: it is not implemented beside other free surfaces",
@@ -54,7 +60,16 @@ EXCLUDED: dict[str, dict[str, str]] = {
     },
     "design.over": {"design.robust": "⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already"},
 }
-#: The same of what follows from other settings, too.
+#: Feature -> settings of which it needs one -> message.
+NEEDED: dict[str, tuple[tuple[str, ...], str]] = {
+    "target.sheet": (("lens.array",), _SHEET),
+    "second.file": (("second.z",), "⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen"),
+    **{
+        feature: (TRAITS["two sides"].settings, f"⟨{feature}⟩ belongs to ⟨+second.file⟩, which is not given")
+        for feature in ("second.z", "second.size")
+    },
+}
+#: The same as EXCLUDED of what follows from other settings, too.
 EXCLUDED_LATER: dict[str, dict[str, str]] = {
     "lens.array": dict.fromkeys(("design.start offset", "design.network", "design.optimizer"), _LENSLETS),
     "design.waves on": {
@@ -72,7 +87,7 @@ EXCLUDED_LATER: dict[str, dict[str, str]] = {
 def why_excluded(feature: str, s: Settings) -> str:
     """Why settings exclude a feature, "" if they do not."""
     for entry, message in (EXCLUDED | EXCLUDED_LATER)[feature].items():
-        if value := s.chosen(entry):
+        if (value := s.chosen(entry)) is not None:
             path = entry.partition(" ")[0]
             said, usual = f"⟨{path}⟩" if value is True else f"⟨{path}⟩ {value}", default(path) if path in TABLE else ""
             return message.format(path=path, value=value, said=said, default=usual, feature=feature)
@@ -90,11 +105,14 @@ def refuse_excluded(feature: str, s: Settings) -> None:
 
 
 def refuse_contradictions(s: Settings) -> None:
-    """Refuse settings of which one excludes another.
+    """Refuse settings of which one excludes another, or needs one that is not there.
 
     Raises:
         InputError: there are such.
     """
+    for feature, (others, message) in NEEDED.items():
+        if s.chosen(feature) is not None and all(s.chosen(other) is None for other in others):
+            raise InputError(message)
     for feature in EXCLUDED:
-        if s.chosen(feature):
+        if s.chosen(feature) is not None:
             refuse_excluded(feature, s)

@@ -18,6 +18,7 @@ from caustic_cli.config.table import (
 )
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
+from caustic_cli.scene.traits import TRAITS
 
 OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
 BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
@@ -74,30 +75,14 @@ def default_magnification(s: Settings) -> float:
 
 
 def complete_second(s: Settings) -> SecondSettings | None:
-    """The [second] section, which makes the entrance free-form; None for an empty one.
-
-    Raises:
-        InputError: keys contradict each other, or are combined with unsupported features.
-    """
-    second, said = s.second or SecondSettings(), _of_second(s)
-    if not said:
-        for key in ("z", "size"):
-            if key in second:
-                raise InputError(f"⟨second.{key}⟩ belongs to ⟨+second.file⟩, which is not given")
+    """The [second] section, which makes the entrance free-form; None for an empty one."""
+    if all(s.chosen(path) is None for path in TRAITS["two sides"].settings):
         return None
-    if len(said) > 1:
-        raise InputError(f"⟨second.{said[0]}⟩ and ⟨second.{said[1]}⟩ both define the light behind the picture: give one of them")
-    if "focus" in second:
-        places = list(map(list, second["focus"]))
-        second = second.changed(focus=check("second.focus", places[0] if len(places) == 1 else places))
-    if "file" in second and "z" not in second:
-        raise InputError("⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen")
-    return second
-
-
-def _of_second(s: Settings) -> list[str]:
-    """Keys given of those that define the light behind the picture."""
-    return [key for key in ("file", "collimate", "focus") if s.second is not None and s.second.get(key)]
+    second = s.second or SecondSettings()
+    if "focus" not in second:
+        return second
+    places = list(map(list, second["focus"]))
+    return second.changed(focus=check("second.focus", places[0] if len(places) == 1 else places))
 
 
 def complete_second_size(s: Settings) -> SecondSettings | None:

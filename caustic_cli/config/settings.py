@@ -280,12 +280,9 @@ class Settings:
         path, _, only = entry.partition(" ")
         section, _, key = path.partition(".")
         sections = self.elements if section == "element" else (getattr(self, section),)
-        usual = default(path) if path in TABLE else None
-        for value in (getattr(one, key, None) if key else one for one in sections):
-            plane = path == "screen.radius" and value and all(map(math.isinf, value))
-            if value and value != usual and (value == only if only else not plane):
-                return value
-        return None
+        none = (None, "", (), default(path) if path in TABLE else None, PLANE if path == "screen.radius" else None)
+        values = (getattr(one, key, None) if key else one or None for one in sections)
+        return next((value for value in values if value not in none and (not only or value == only)), None)
 
 
 def dump(settings: Settings) -> str:

@@ -377,6 +377,12 @@ class ElementSettings(Section):
     free: str = setting("free-form surfaces to be designed: none, front, back or both", choices=("none", "front", "back", "both"),
             default="none", written=False, why="stock lenses are spherical")
 
+    @property
+    def reshapes(self) -> bool:
+        """Whether it does more than fold the axis, as lenses and curved mirrors do."""
+        flat = self.radius is None or math.isinf(self.radius[0])
+        return not (self.type == "mirror" and flat and self.free == "none")
+
 
 class StageSettings(Section):
     """[[design.stages]]: a stage of the design."""

@@ -7,6 +7,7 @@ import math
 from caustic_cli.config.default_stages import LEAST_WAVES, Table, on_waves, wave_refinement
 from caustic_cli.config.exclusions import refuse_excluded, why_excluded
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen, build_source
+from caustic_cli.effort import Effort
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Scene, Source
 
@@ -26,7 +27,7 @@ def without_waves(s: Settings, given: bool) -> str:
     return excluded or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; ⟨waves⟩ on takes it"
 
 
-def wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Table]:
+def wave_stages(s: Settings, source: Source, effort: Effort, lit: tuple[float, float]) -> list[Table]:
     """Stages that refine the wave image after the ray image, on request or where diffraction matters."""
     lens, screen, asked = s.lens, s.screen, s.design.waves
     if asked == "on":
@@ -37,7 +38,7 @@ def wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, flo
     if asked == "auto" and (seen.source > seen.pixel or not seen.matters):
         return []
     own = s.source.get("wavelengths", ())
-    plan = wave_refinement(_wave_samples(s, seen, lit), len(own), quality, timed=asked == "auto")
+    plan = wave_refinement(_wave_samples(s, seen, lit), len(own), effort, timed=asked == "auto")
     apron = math.ceil(0.04 * max(screen.resolution))
     return [on_waves(lens.control, list(map(float, own)) or white(count), apron, n) for count, n in plan]
 

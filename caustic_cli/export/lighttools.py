@@ -54,7 +54,7 @@ def write_lighttools(
     """Write the archive atomically: a point cloud, and the spline itself.
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
-    screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_source`; fresnel unless exact; aperture if a circle;
+    screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_sources`; fresnel unless exact; aperture if a circle;
     mirror, 1, of one; those of `_glass`, `_light` and `_elements`; those of `_entrance` where it is free-form; control_points
     (n, m, 3) with x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit, format_version, created_by.
 
@@ -87,7 +87,7 @@ def write_lighttools(
         "z_screen": _reals(scene.screen.z),
         "resolution": np.array(scene.screen.resolution, np.int64),
         **_screen(scene.screen),
-        **_source(scene),
+        **_sources(scene),
         **{key: np.array(value) for key, value, usual in _unusual(scene.lens) if value != usual},
         **_glass(scene.lens),
         **_light(scene.light),
@@ -167,11 +167,17 @@ def _light(light: Light) -> dict[str, np.ndarray]:
     """Optional keys of the light: source_power_unit, unless W; source_wavelengths (k,), nm, with source_weights (k,); source_color,
     1, if these are those of a coloured picture; source_polarisation, degrees from +x."""
     found = {} if light.unit == "W" else {"source_power_unit": np.array(light.unit)}
-    if light.wavelengths:
-        found |= {"source_wavelengths": _reals(light.wavelengths), "source_weights": _reals(light.fractions)}
+    found |= _spectrum(light)
     if light.color:
         found["source_color"] = np.array(1, np.int64)
     return found if light.polarisation is None else found | {"source_polarisation": _reals(light.polarisation)}
+
+
+def _spectrum(light: Light) -> dict[str, np.ndarray]:
+    """Its wavelengths and weights."""
+    if not light.wavelengths:
+        return {}
+    return {"source_wavelengths": _reals(light.wavelengths), "source_weights": _reals(light.fractions)}
 
 
 def _entrance(scene: Scene) -> dict[str, np.ndarray]:
@@ -229,8 +235,23 @@ def _screen(screen: Screen) -> dict[str, np.ndarray]:
     return found
 
 
+def _sources(scene: Scene) -> dict[str, np.ndarray]:
+    """Keys of the source; of k simultaneous ones source_type "several", source_count (1,), and of each those of a single source
+    and of its light with its number: source_1_type, source_1_positions, ..., source_1_cone_half_angle, source_1_wavelengths.
+
+    The power of each is its own; source_wavelengths and source_weights are those of the light of all.
+    """
+    if len(scene.by_source) == 1:
+        return _source(scene)
+    found = {"source_type": np.array("several"), "source_count": np.array([len(scene.by_source)], np.int64)}
+    for k, one in enumerate(scene.by_source, 1):
+        own = _source(one) | _spectrum(one.light)
+        found |= {f"source_{k}_{key.removeprefix('source_')}": value for key, value in own.items()}
+    return found
+
+
 def _source(scene: Scene) -> dict[str, np.ndarray]:
-    """Keys of the source.  A plane wave has no positions, one power, and cone 0.
+    """Keys of a single source.  A plane wave has no positions, one power, and cone 0.
 
     `source_power` (k,), of each position; (1,), through the aperture, for a plane wave or a disc at infinity.  `source_profile`
     (a, b), the relative irradiance over the aperture [i, j], only for a non-uniform wave; `source_size` (2,) mm

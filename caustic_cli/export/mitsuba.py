@@ -253,12 +253,14 @@ def _camera(screen: Screen, away: float, place: str, depth: int = DEPTH) -> list
 
 
 def _screen(screen: Screen, spin: str, onto: str = "") -> list[str]:
-    """White rectangle facing +z, or -z with `spin`; onto: transformation to a folded axis."""
+    """White rectangle facing +z, or -z with `spin`, tilted about its centre; onto: transformation to a folded axis."""
     sx, sy = screen.half_size
+    leaning = "".join(f'<rotate {axis}="1" angle="{real(t)}"/>' for axis, t in zip("xy", screen.tilt, strict=True) if t)
     return [
         '<shape type="rectangle" id="screen">',
         '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
-        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/>{_moved(screen, screen.z)}{onto}</transform>',
+        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/>{leaning}{_moved(screen, screen.z)}{onto}'
+        "</transform>",
         "</shape>",
     ]
 

@@ -25,7 +25,7 @@ SOURCE = "⟨format⟩ {format} does not support sources of type {scene.source.k
 #: Beyond what ONE_INDEX and TWO_SIDED say.
 _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     "zemax": {"other elements": ONE_LENS},
-    "lighttools": dict.fromkeys(("several sources", "user-defined source"), SOURCE),
+    "lighttools": {"user-defined source": SOURCE},
     "mitsuba": {
         **dict.fromkeys(
             [name for name in BEYOND_CLEAR if name not in ("mirror", "gradient index", "shifted screen")],
@@ -57,7 +57,7 @@ SCRIPT = Capability(
     "script for LightTools",
     {
         "two sides": ONE_SIDE,
-        "other elements": ONE_LENS,
+        **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
         **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
         "gradient index": SHAPE,
         "lumens": "⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written",
@@ -67,7 +67,8 @@ SCRIPT = Capability(
             "⟨script⟩: its source is evenly bright and uniform or Lambertian, so a picture, a table or a ray file cannot be"
             " written",
         ),
-        **dict.fromkeys(("several sources", "user-defined source"), SOURCE),
+        "several sources": "⟨script⟩ builds one source, so that several, which the archive alone holds, cannot be written",
+        "user-defined source": SOURCE,
         "elliptical disc": "⟨script⟩: its disc is round, so an elliptical one cannot be written",
         "circular aperture": "⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written",
     },

@@ -55,6 +55,7 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
         f"! vertex {real(vertex - lens.z_in)} mm behind the flat entrance, index {real(lens.index)},"
         f" screen {real(scene.screen.z - vertex)} mm behind the vertex",
         *([f"! the screen is {scene.screen.shape_words()}, which this file does not contain"] if scene.screen.curved else []),
+        *(["! along the axis, which flat mirrors fold, that this file does not contain"] if scene.elements else []),
         *([f"! circular aperture of radius {real(lens.half_size[0])} mm"] if lens.opening.round else []),
         f"{nx} {ny} {real((grid.x[-1] - grid.x[0]) / (nx - 1))} {real((grid.y[-1] - grid.y[0]) / (ny - 1))} 0 0 0",
         "",

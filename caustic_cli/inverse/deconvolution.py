@@ -29,11 +29,9 @@ from torch import Tensor
 
 from caustic_cli.optics.spread import Convolution
 
-#: Iterations after which x is returned (early stopping keeps it smooth) and of the search for the least error; interval of its
-#: checks.
-SMOOTH_STEPS, MOST_STEPS, LOOK = 60, 1000, 50
-#: Budget of iterations times cells, about a second, and least number of iterations; the same for the bound alone, a few seconds.
-WORK, LEAST_STEPS = 3e7, 300
+#: Iterations after which x is returned, since early stopping keeps it smooth; interval of the checks for the least error.
+SMOOTH_STEPS, LOOK = 60, 50
+#: Budget of iterations times cells for the bound alone, a few seconds, and least number of iterations.
 BOUND_WORK, BOUND_STEPS = 1e8, 100
 #: Most cells per pixel along each axis.
 FINEST = 2
@@ -61,16 +59,15 @@ class Deconvolved:
     kept: float
 
 
-def deconvolved(target: np.ndarray, spread: Convolution, steps: int | None = None) -> Deconvolved:
+def deconvolved(target: np.ndarray, spread: Convolution, steps: int) -> Deconvolved:
     """The irradiance that, blurred by an extended source, is closest to a picture.
 
     Args:
         target: (n, m), not negative, not all zero, any scale.
         spread: convolution with the source's image on the target's pixels.
-        steps: iterations; None for about a second of them.
+        steps: most iterations.
     """
     b, cut = torch.from_numpy(target / target.mean()), spread.cut
-    steps = steps or _budget(b, [spread], WORK, LEAST_STEPS)
     light, kept, least, bound = np.zeros_like(target), 1.0, math.inf, 0.0
     for k, ((x,), c) in enumerate(itertools.islice(_iterates(b, [spread]), steps), 1):
         if k == min(SMOOTH_STEPS, steps):
@@ -85,13 +82,13 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int | None = Non
     return Deconvolved(light, tuple(n // cut for n in spread.beside), least, bound, kept)
 
 
-def error_bound(target: np.ndarray, spreads: Sequence[Convolution], steps: int | None = None) -> float:
+def error_bound(target: np.ndarray, spreads: Sequence[Convolution], most: int) -> float:
     """Lower bound of the relative RMS error of any sum of irradiances, each blurred by one of these.
 
-    target, steps: as of `deconvolved`.
+    target: as of `deconvolved`; most: iterations, of which large pictures get fewer.
     """
     b = torch.from_numpy(target / target.mean())
-    steps = steps or _budget(b, spreads, BOUND_WORK, BOUND_STEPS)
+    steps = int(min(most, max(BOUND_STEPS, BOUND_WORK / sum(_cells(b, spread).numel() for spread in spreads))))
     least, bound = math.inf, 0.0
     for k, (x, c) in enumerate(itertools.islice(_iterates(b, spreads, LEAST_REACH), steps), 1):
         if k % LOOK == 0 or k == steps:
@@ -105,11 +102,6 @@ def error_bound(target: np.ndarray, spreads: Sequence[Convolution], steps: int |
 def _tight(error: float, bound: float) -> bool:
     """Whether further iterations have nothing to find."""
     return bound > (1.0 - TIGHT) * error or error < NO_ERROR
-
-
-def _budget(b: Tensor, spreads: Sequence[Convolution], work: float, least: int) -> int:
-    """Number of iterations, at least this many."""
-    return int(min(MOST_STEPS, max(least, work / sum(_cells(b, spread).numel() for spread in spreads))))
 
 
 def _iterates(b: Tensor, spreads: Sequence[Convolution], least: float = 1.0) -> Iterator[tuple[list[Tensor], float]]:

@@ -17,6 +17,7 @@ import torch
 from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
+from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.projection import ScreenProjection
@@ -29,8 +30,6 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Component, Lens, Scene
 from caustic_cli.scene.elements import SIDES
 
-#: Source cells along the lens' longer side: a picture of 250 x 250 pixels is resolved, and they are cheap.
-CELLS = 256
 #: Most cells for which transport is solved.  Where more are needed, as for creases, it is solved on about COARSE, and the map is
 #: evaluated on finer cells.
 SOLVED, COARSE = 1024, 512
@@ -45,8 +44,8 @@ OVERSHOOT = 2.0
 PASSES = 3
 #: Lower bound of the irradiance of a near source over its mean: a trade-off between the picture and the number of Newton steps.
 DARKEST = 0.02
-#: Cells on which the vertex height is chosen for a near source; efficiency that is accepted at once.
-FEW_CELLS, ENOUGH_LIGHT = 64, 0.7
+#: Efficiency of a vertex height for a near source that is accepted at once.
+ENOUGH_LIGHT = 0.7
 #: Vertex heights that are tried otherwise, in parts of the thickness of the lens.
 TRIED = (0.3, 0.45, 0.65, 1.5, 2.2, 3.3)
 #: Most repetitions without the cells whose light cannot be refracted to the picture, before it counts as out of reach.
@@ -207,7 +206,13 @@ class _TruncatedSurface:
 
 
 def first_surface(
-    scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS, fixed: bool = False, seconds: float = math.inf
+    scene: Scene,
+    target: np.ndarray,
+    field: HeightField,
+    cells: int = STANDARD.source_cells,
+    fixed: bool = False,
+    seconds: float = math.inf,
+    few: int = STANDARD.vertex_cells,
 ) -> InitialSurface:
     """Initial surface for a picture, from light of the centre of the source.
 
@@ -218,6 +223,7 @@ def first_surface(
         cells: source cells along the lens' longer side; more than SOLVED sharpen creases, for distant sources.
         fixed: the thickness is given by the user, and no other is tried.
         seconds: approximate time allowed for a near source, which limits its cells.
+        few: cells on which the vertex height is chosen for such a source.
 
     Raises:
         InputError: the picture cannot be reached by refraction.
@@ -238,10 +244,10 @@ def first_surface(
         if times > 1:
             grid, z = grid.sharper(found, times)
         return InitialSurface(net_of(grid.x, grid.y, z, field))
-    coarse = _Grid.of(scene, target, min(cells, FEW_CELLS))
+    coarse = _Grid.of(scene, target, min(cells, few))
     found = _best(coarse, lens.offset.thickness, fixed)
     within = cells
-    for most, passes in ((round(math.sqrt(FEW_CELLS * cells)), PASSES - 1), (cells, 1)):
+    for most, passes in ((round(math.sqrt(few * cells)), PASSES - 1), (cells, 1)):
         n, started = min(most, within), time.monotonic()
         if n < max(len(coarse.x), len(coarse.y)):
             continue

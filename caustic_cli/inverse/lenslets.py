@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.initial_surface import CELLS, first_surface
+from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.mixture import Member, Mixture
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.optics.resampling import resampled
@@ -129,7 +129,7 @@ def assemble(nets: Sequence[Tensor], array: tuple[int, int]) -> AssembledArray:
     return AssembledArray(net / count, max((float(g.abs().max()) for g in gaps if g.numel()), default=0.0))
 
 
-def initial_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[int, int], cells: int = CELLS) -> AssembledArray:
+def initial_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[int, int], cells: int) -> AssembledArray:
     """Initial surface of an array by optimal transport, solved for each lenslet.
 
     Args:

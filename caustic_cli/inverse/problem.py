@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config.table import check_all
+from caustic_cli.effort import STANDARD, Effort
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.loss_terms import parse
@@ -72,13 +73,22 @@ class Problem:
         target: (n_x, n_y) irradiance on the scene's screen, not all zero.
         stages, options: of the optimisation.
         device: where rays are traced.
+        effort: of the initial surface and of the evaluation.
 
     Raises:
         InputError: stages and options contradict each other, or the lens leaves no room before the screen.
     """
 
-    def __init__(self, scene: Scene, target: Tensor, stages: list[Stage], options: Options, device: str = "cpu"):
-        self.scene, self.target, self.device = scene, target, device
+    def __init__(
+        self,
+        scene: Scene,
+        target: Tensor,
+        stages: list[Stage],
+        options: Options,
+        device: str = "cpu",
+        effort: Effort = STANDARD,
+    ):
+        self.scene, self.target, self.device, self.effort = scene, target, device, effort
         self.stages, self.options = stages, options
         self._prepare()
 
@@ -140,18 +150,14 @@ class Problem:
         return self._room[control]
 
     def _bounds(self, k: int) -> tuple[Tensor, Tensor]:
-        lens, field = self.scene.lens, self.field(k)
-        low, high = lens.height_bounds(*(c.numpy() for c in field.control_xy()))
-        for scene in self.scenes:
-            screen = scene.screen
-            nearest, farthest = reach(screen)
-            if lens.mirror and low.min() <= screen.z + farthest:
+        lens, side = self.scene.lens, self.scene.lens.interaction.side
+        low, high = lens.height_bounds(*(c.numpy() for c in self.field(k).control_xy()))
+        top = side * max((side * z).max() for z in (low, high))  # towards the screen
+        for screen in (scene.screen for scene in self.scenes):
+            if side * (screen.z - top) <= max(-side * bound for bound in reach(screen)):
                 raise InputError(
-                    f"⟨screen.z⟩ must lie before the mirror, whose surface may reach {low.min():.4g} mm, got {screen.z:g} mm"
-                )
-            if not lens.mirror and high.max() >= screen.z + nearest:
-                raise InputError(
-                    f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm, got {screen.z:g} mm"
+                    f"⟨screen.z⟩ must lie {lens.interaction.beyond} the {lens.kind}, whose surface may reach {top:.4g} mm,"
+                    f" got {screen.z:g} mm"
                 )
         return torch.from_numpy(low), torch.from_numpy(high)
 

@@ -42,6 +42,7 @@ def robust_objective(
     Raises:
         InputError: none of the errors applies to the scene.
     """
+    scene = scene.unfolded
     parameters = tuple(p for p in tolerances.parameters if p.error != "roughness" and not reason_ignored(scene, p.error))
     fits = tolerances.surface and _resolves(field, tolerances.shortest)
     if not (parameters or fits):

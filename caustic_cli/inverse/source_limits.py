@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from caustic_cli.effort import STANDARD
 from caustic_cli.errors import at_most
 from caustic_cli.inverse.deconvolution import BOUND_STEPS, BOUND_WORK, FINEST, NO_ERROR, Deconvolved, deconvolved, error_bound
 from caustic_cli.inverse.schedule import Stage
@@ -42,7 +43,7 @@ CONVOLUTION = Capability(
     {
         "separate places": "its places have images of their own",
         **dict.fromkeys(("tilted screen", "curved screen"), "the image of the source varies over the screen"),
-        "other elements": "the blur by the lens alone is not that on the screen",
+        **dict.fromkeys(("other elements", "folded axis"), "the blur by the lens alone is not that on the screen"),
     },
 )
 
@@ -79,22 +80,23 @@ class SourceLimits:
         return "; ".join(found)
 
 
-def performance_limits(scene: Scene, target: np.ndarray, steps: int | None = None) -> SourceLimits:
+def performance_limits(scene: Scene, target: np.ndarray, most: int = STANDARD.bound_steps) -> SourceLimits:
     """Limits for any lens under the source of a scene.
 
-    target: (n, m) irradiance, or (3, n, m) in colour, whose bound is the mean of its colours', as their error is; steps: as of
-    `deconvolved`.
+    target: (n, m) irradiance, or (3, n, m) in colour, whose bound is the mean of its colours', as their error is; most:
+    iterations, as of `error_bound`.
     """
+    scene = scene.unfolded
     if not (scene.source.extended and LIMITS.supports(scene)):
         return SourceLimits(None, None)
     images = source_images(scene)
     seen = bool(images) and LEAST_REACH * max(scene.screen.pixel) < max(images[0].reach()) <= max(scene.screen.size)
-    errors = [_least_error(one, images, scene.screen.pixel, steps) for one in np.atleast_3d(target.T).T if one.any() and seen]
+    errors = [_least_error(one, images, scene.screen.pixel, most) for one in np.atleast_3d(target.T).T if one.any() and seen]
     error = sum(errors) / len(errors) if errors else 0.0
     return SourceLimits(error if error > NO_ERROR else None, etendue_limit(scene))
 
 
-def _least_error(target: np.ndarray, images: list[Spread], pixel: tuple[float, float], steps: int | None) -> float:
+def _least_error(target: np.ndarray, images: list[Spread], pixel: tuple[float, float], most_steps: int) -> float:
     """Lower bound of the error of any lens with these images of its source, the sharpest first.
 
     Where it would take too long, pixels much smaller than the blur are binned: the error of binned images is no larger than theirs.
@@ -104,10 +106,10 @@ def _least_error(target: np.ndarray, images: list[Spread], pixel: tuple[float, f
     work = len(images) * target.size * FINEST**2 * BOUND_STEPS
     k = next((k for k in sides if work <= BOUND_WORK * k * k), sides[-1])
     binned = target.reshape(n // k, k, m // k, k).mean((1, 3))
-    return error_bound(binned, [image.on((pixel[0] * k, pixel[1] * k), FINEST) for image in images], steps)
+    return error_bound(binned, [image.on((pixel[0] * k, pixel[1] * k), FINEST) for image in images], most_steps)
 
 
-def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int | None = None) -> Deconvolved:
+def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int) -> Deconvolved:
     """The deconvolution of a target by the source's blur on the screen of a scene; see `deconvolved`."""
     return deconvolved(target, spread.on(scene.screen.pixel, FINEST), steps)
 

@@ -81,7 +81,7 @@ class WaveObjective:
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ):
-        how = how or LossImage()
+        how, scene = how or LossImage(), scene.unfolded
         self.scene, self.field, self.apron, self.dtype = scene, field, how.apron, dtype
         self.middle = heights.detach().double().to(device)
         screen = scene.screen.grown((how.apron, how.apron))

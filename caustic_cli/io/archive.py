@@ -13,6 +13,7 @@ from torch import Tensor
 from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import Archive, open_npz
+from caustic_cli.io.files import naming
 from caustic_cli.io.surfaces import ACCEPTED, MAX_CONTROL, surface_of
 from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.bspline import MAX_DEGREE
@@ -27,7 +28,14 @@ from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 from caustic_cli.scene.sources.points import MAX_POINTS
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
+from caustic_cli.scene.sources.several import MOST, Several
 
+#: Keys of a source and of its spectrum.
+KEYS = (
+    *("cone_half_angle", "source_type", "source_positions", "source_power", "source_profile", "source_size", "source_angle"),
+    *("source_intensity", "source_intensity_table", "source_brightness", "source_rays_sha256"),
+    *("source_wavelengths", "source_weights"),
+)
 #: Most cells along an axis of a picture of a source.
 MOST_CELLS = 1 << 16
 
@@ -70,12 +78,18 @@ def open_archive(path: str | Path, rays: RaySet | None = None) -> tuple[Scene, H
 
 def _light(data: Archive) -> Light:
     """Wavelengths and polarisation; see `export/lighttools.py`."""
+    wavelengths, weights = _spectrum(data)
+    polarisation = data.real("source_polarisation") if "source_polarisation" in data else None
+    return Light(polarisation, wavelengths, weights, color="source_color" in data, unit=data.text("source_power_unit", "W"))
+
+
+def _spectrum(data: Archive) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Wavelengths, nm, and weights; empty if absent."""
     wavelengths, weights = (
         tuple(data.reals(f"source_{key}", None, most=MAX_WAVELENGTHS).tolist()) if f"source_{key}" in data else ()
         for key in ("wavelengths", "weights")
     )
-    polarisation = data.real("source_polarisation") if "source_polarisation" in data else None
-    return Light(polarisation, wavelengths, weights, color="source_color" in data, unit=data.text("source_power_unit", "W"))
+    return wavelengths, weights
 
 
 def _elements(data: Archive) -> tuple[Component, ...]:
@@ -145,13 +159,32 @@ def _radius(data: Archive) -> tuple[float, float]:
 
 def _source(data: Archive, rays: RaySet | None) -> Source:
     kind = data.text("source_type")
+    if kind == "several":
+        return _several(data, rays)
     if kind == "rays":
         return _measured(data, rays)
     if kind not in _READERS:
-        raise InputError(f"source_type must be plane, point, grid, disc or rays, got {kind!r}")
+        raise InputError(f"source_type must be plane, point, grid, disc, rays or several, got {kind!r}")
     if rays is not None:
         raise InputError(f"⟨source.file⟩ belongs to an archive whose source is a ray file, and this one's is of type {kind}")
     return _READERS[kind](data)
+
+
+def _several(data: Archive, rays: RaySet | None) -> Several:
+    """Several sources, of which those that are ray files have these rays."""
+    (count,) = data.wholes("source_count", 1)
+    members, spectra, files = [], [], 0
+    for k in range(1, min(count, MOST) + 1):
+        with naming(f"source {k}"):
+            one = data.renamed({key: f"source_{k}_{key.removeprefix('source_')}" for key in KEYS})
+            if one.text("source_type") == "several":
+                raise InputError("source_type must be that of a single source, got 'several'")
+            files += one.text("source_type") == "rays"
+            members.append(_source(one, rays if one.text("source_type") == "rays" else None))
+            spectra.append(_spectrum(one))
+    if rays is not None and not files:
+        raise InputError("⟨source.file⟩ belongs to an archive whose source is a ray file, and none of this one's is")
+    return Several(tuple(members), tuple(spectra))
 
 
 def _measured(data: Archive, rays: RaySet | None) -> Measured:

@@ -11,13 +11,14 @@ MOST_BYTES, all arrays read from an archive MOST_IN_ALL, and its central directo
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
 import os
 import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -189,6 +190,12 @@ class Archive:
 
     def __contains__(self, name: str) -> bool:
         return name in self._members
+
+    def renamed(self, names: Mapping[str, str]) -> Archive:
+        """The arrays with these names, by others: name here -> name there."""
+        view = copy.copy(self)
+        view._members = {new: self._members[old] for new, old in names.items() if old in self}
+        return view
 
     @contextlib.contextmanager
     def open(self, name: str) -> Iterator[Stored]:

@@ -21,6 +21,7 @@ KINDS = (
     ("element", "elements.FreeElements"),
     ("design.over", "network_range.NetworkAmongElements"),
     ("design.over", "network_range.NetworkOverRange"),
+    ("design.robust", "robust.RobustAmongElements"),
     ("element", "elements.AmongElements"),
     ("design.robust", "robust.RobustArray"),
     ("lens.array", "lenslet_array.LensletArray"),
@@ -31,7 +32,7 @@ KINDS = (
 def kind_of(s: Settings) -> type[OneSurface]:
     """The kind of the design of these settings."""
     for setting, name in KINDS:
-        if s.chosen(setting):
+        if s.chosen(setting) is not None:
             module, _, title = name.partition(".")
             kind = cast(type[OneSurface], getattr(import_module(f"{__name__}.{module}"), title))
             if kind.applies(s):

@@ -7,16 +7,17 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
-from caustic_cli.config.default_stages import LEAST_SPANS, RAYS_PER_PIXEL, Table, completed_stage, usual_sampler
+from caustic_cli.config.default_stages import RAYS_PER_PIXEL, Table, completed_stage, usual_sampler
 from caustic_cli.config.design import relative_to_initial
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen
 from caustic_cli.config.table import DesignSettings, LensSettings, StageSettings, check
+from caustic_cli.effort import DRAFT, EFFORTS, FINE, STANDARD, Effort, current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.scene import Scene, Source
 
-DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and above which another quality uses the time better
-EXTENDED = 5.0  # factor of these limits for an extended source, whose start includes a deconvolution
+EXTENDED = 5.0  # factor of the time limits of qualities for an extended source, whose start includes a deconvolution
+LEAST_SPANS = STANDARD.refinement.least_spans  # which resolve an initial surface
 
 
 class Defaults:
@@ -72,10 +73,12 @@ class Defaults:
             )
 
     @cached_property
-    def quality(self) -> str:
-        """The quality asked for, or that which the time limit permits at 250 x 250 pixels on two cores."""
+    def effort(self) -> Effort:
+        """That of the quality asked for, or of that which the time limit permits at 250 x 250 pixels on two cores."""
+        if self.asked:
+            return EFFORTS[check("quality", self.asked)]
         seconds = self.design.time_limit / (EXTENDED if self.source.extended else 1.0)
-        return self.asked or ("draft" if seconds < DRAFT_SECONDS else "fine" if FINE_SECONDS <= seconds < math.inf else "standard")
+        return DRAFT if seconds < STANDARD.seconds else FINE if FINE.seconds <= seconds < math.inf else current_effort()
 
     @property
     def resolution(self) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from caustic_cli.config.default_stages import Table, two_sided
+from caustic_cli.config.default_stages import Table, refinement
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import departure_bound, sphere_net
@@ -31,7 +31,7 @@ class AmongElements(OneSurface):
     @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
         if cls.exact_start(d):
-            return two_sided(d.lens.control, d.rays, d.resolution, d.quality)
+            return refinement(d.lens.control, d.rays, d.resolution, d.effort.system)
         return super().default_stages(d, waves)
 
     def _bounds(self, k: int) -> tuple[Tensor, Tensor]:
@@ -44,11 +44,19 @@ class AmongElements(OneSurface):
             )
         return low, high
 
+    @property
+    def _folded(self) -> bool:
+        """Whether the other elements only fold the axis."""
+        return not self.scene.unfolded.elements
+
     def refuse_unreachable(self) -> None:
-        """The transport says what it cannot reach."""
+        """Behind elements that do more than fold the axis, the transport says what it cannot reach."""
+        if self._folded:
+            super().refuse_unreachable()
 
     def resolution_notes(self, seen: Resolution) -> Iterator[str]:
-        yield from ()
+        if self._folded:
+            yield from super().resolution_notes(seen)
 
 
 class FreeElements(SeveralSurfaces, AmongElements):

@@ -19,7 +19,7 @@ from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.studies.metrics import judged
-from caustic_cli.studies.retrace import RELATIVE_NOISE, evaluation_rays, retrace
+from caustic_cli.studies.retrace import evaluation_rays, retrace
 
 by_waves = OnDemand("caustic_cli.studies.waves")
 
@@ -56,9 +56,9 @@ class Seen(NamedTuple):
 class LensEvaluation:
     """Figures of a finished lens, and the lens that is kept; see `OneSurface.evaluate`."""
 
-    def __init__(self, designer: Designer, state: State, rays: int, size: tuple[float, float], timed: bool):
+    def __init__(self, designer: Designer, state: State, size: tuple[float, float], timed: bool):
         self.problem, self.designer, self.state, self.timed = designer.problem, designer, state, timed
-        self.count = evaluation_rays(designer.scene, rays)
+        self.count = evaluation_rays(designer.scene, self.problem.effort.final_rays)
         self.field = designer.field(state.stage)
         self.refined = any(s.waves for s in designer.stages[: state.stage + 1])
         self.seen = Resolution.before(designer.scene, size)
@@ -76,7 +76,7 @@ class LensEvaluation:
             device=self.problem.device,
             seed=self.problem.options.seed,
             noise=noise,
-            quiet=None if self.timed else RELATIVE_NOISE,
+            quiet=None if self.timed else self.problem.effort.noise,
         )
 
     def see(self, heights: Tensor, noise: bool = True) -> Seen:

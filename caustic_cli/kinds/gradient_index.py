@@ -67,7 +67,7 @@ class IndexPlate(OneSurface):
         d.set_design(start="offset")  # of the surface, which is flat; the index starts from optimal transport
         d.fill_design(preconditioner="laplacian")
         if "stages" not in design:
-            last = refinement(lens.control, d.rays, d.resolution, d.quality)[-1]
+            last = refinement(lens.control, d.rays, d.resolution, d.effort.refinement)[-1]
             d.set_stages([last | {"rays": d.rays or min(last["rays"], RAYS_BENT * math.prod(d.resolution))}])
 
     def iterate(
@@ -109,7 +109,7 @@ class IndexPlate(OneSurface):
             lens.index_control,
             lens.index_layers,
             lens.index_range,
-            cells=transport_cells(stage.rays, False),
+            cells=transport_cells(stage.rays, False, least=self.effort.source_cells),
             iterations=total,
             rays=stage.rays,
             seed=self.options.seed,

@@ -23,9 +23,6 @@ from caustic_cli.kinds.surface import Described, OneSurface
 from caustic_cli.scene import Scene
 from caustic_cli.scene.lens import array_control
 
-#: Least number of source cells along a lenslet.
-LEAST_CELLS = 128
-
 
 class LensletArray(OneSurface):
     """An array of lenslets.
@@ -94,5 +91,5 @@ class LensletArray(OneSurface):
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
         goals = [grey(target.numpy()) for target in self.targets] or [goal]
-        cells = max(LEAST_CELLS, cells // max(scene.lens.array))
+        cells = max(self.effort.lenslet_cells, cells // max(scene.lens.array))
         return InitialSurface(initial_array(scene, goals, self.stages[0].control, cells).heights)

@@ -61,7 +61,7 @@ class NetworkOverRange(OneSurface):
 
     @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
-        last = refinement(d.lens.control, d.sampled, d.resolution, d.quality)[-1]
+        last = refinement(d.lens.control, d.sampled, d.resolution, d.effort.refinement)[-1]
         return [last | {"iterations": OVER_ITERATIONS, "tolerance": 0.0}]
 
     def check(self) -> None:
@@ -104,7 +104,7 @@ class NetworkOverRange(OneSurface):
         return 2.0 * len(self.ranges.evaluation_points()) / OVER
 
     def further_figures(self, designer: Designer, state: State) -> dict[str, Any]:
-        return {"over": self.errors(designer, state, self.final_rays // OVER, self.options.seed)}
+        return {"over": self.errors(designer, state, self.effort.final_rays // OVER, self.options.seed)}
 
     def errors(self, designer: Designer, state: State, rays: int, seed: int, middle: bool = True) -> list[dict[str, float]]:
         """Figures at each of `Ranges.evaluation_points`, with independent rays: the parameter values by their keys, mm;

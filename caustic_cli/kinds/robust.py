@@ -9,6 +9,7 @@ from torch import Tensor
 from caustic_cli.config.settings import Settings
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.robust import robust_objective
+from caustic_cli.kinds.elements import AmongElements
 from caustic_cli.kinds.lenslet_array import LensletArray
 from caustic_cli.kinds.surface import Described, OneSurface
 from caustic_cli.scene import Scene
@@ -47,6 +48,10 @@ class RobustSurface(OneSurface):
         return robust_objective(
             lambda scene, heights: self.objective_in(scene, k, heights), self.scene, self.field(k), initial, self.tolerances
         )
+
+
+class RobustAmongElements(RobustSurface, AmongElements):
+    """One surface behind which mirrors fold the axis, robust."""
 
 
 class RobustArray(RobustSurface, LensletArray):

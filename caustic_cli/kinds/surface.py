@@ -19,13 +19,13 @@ from caustic_cli.config.default_stages import (
     creased_control,
     on_rays,
     refinement,
-    refinement_spans,
     transport_cells,
 )
 from caustic_cli.config.design import build_options, build_stages, relative_to_initial
 from caustic_cli.config.settings import Settings, build_screen
 from caustic_cli.config.table import LensSettings, ScreenSettings, check, default
 from caustic_cli.config.wave_stages import wave_stages
+from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
@@ -54,7 +54,7 @@ from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
-from caustic_cli.studies.retrace import FINAL_RAYS, retrace
+from caustic_cli.studies.retrace import retrace
 
 waves, manufacture = OnDemand("caustic_cli.inverse.wave_objective"), OnDemand("caustic_cli.studies.manufacture")
 
@@ -103,7 +103,7 @@ class OneSurface(Problem):
         """The problem of a project."""
         scene, s = described.scene(), described.settings
         target = torch.from_numpy(described.target(scene))
-        return cls(scene, target, build_stages(s), build_options(s), device, **cls.further(described, scene))
+        return cls(scene, target, build_stages(s), build_options(s), device, current_effort(), **cls.further(described, scene))
 
     @classmethod
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
@@ -140,7 +140,7 @@ class OneSurface(Problem):
                     + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves")
                 )
             return
-        waves = wave_stages(d.s, d.source, d.quality, d.lit)
+        waves = wave_stages(d.s, d.source, d.effort, d.lit)
         stages = cls.default_stages(d, waves) + waves
         if d.design.loss.strip() == "rms":  # eq. 5.2.1 is defined on the screen only
             stages = [stage | {"apron": 0} for stage in stages]
@@ -191,7 +191,7 @@ class OneSurface(Problem):
         """The control net unless one is given."""
         if d.trained:
             return [NETWORK_CONTROL] * 2
-        spans = refinement_spans(max(d.resolution), d.quality) if cls.exact_start(d) else DEFAULT_SPANS
+        spans = d.effort.refinement.spans(max(d.resolution)) if cls.exact_start(d) else DEFAULT_SPANS
         return [spans + p for p in d.lens.degree]
 
     @classmethod
@@ -201,7 +201,7 @@ class OneSurface(Problem):
         if cls.exact_start(d):
             return cls.refinement(d, cls.creased(d, waves))
         if d.plain and "knots_u" not in lens:
-            return coarse_to_fine(lens.control, lens.degree, d.sampled, d.resolution, d.quality, sampler=d.sampler)
+            return coarse_to_fine(lens.control, lens.degree, d.sampled, d.resolution, d.effort, sampler=d.sampler)
         return [
             on_rays(
                 lens.control,
@@ -223,7 +223,7 @@ class OneSurface(Problem):
         aligned = d.source.distant and build_screen(d.s.screen).upright
         creased = d.gaps >= GAPS and not (d.own_control or waves or cls.spread(d)) and aligned
         if creased:
-            d.set_control([creased_control(max(d.resolution), p, d.quality) for p in d.lens.degree])
+            d.set_control([creased_control(max(d.resolution), p, d.effort.creased) for p in d.lens.degree])
         return creased
 
     @classmethod
@@ -231,7 +231,8 @@ class OneSurface(Problem):
         """The stages after a transport start."""
         spread = cls.spread(d)
         centre = d.source.pointlike() if spread else d.source
-        return refinement(d.lens.control, d.rays, d.resolution, d.quality, not centre.collimated, spread, creased)
+        how = d.effort.creased if creased else d.effort.refinement
+        return refinement(d.lens.control, d.rays, d.resolution, how, not centre.collimated, spread)
 
     # Numerics
 
@@ -311,7 +312,7 @@ class OneSurface(Problem):
             InputError: the screen is obstructed, or the picture cannot be reached by refraction.
         """
         for scene in self.scenes:
-            refuse_unreachable(scene, grey(self.target.numpy()))
+            refuse_unreachable(scene.unfolded, grey(self.target.numpy()))
 
     def refuse_obstructed(self) -> None:
         """Refuse a screen that is in the light of its source.
@@ -344,7 +345,7 @@ class OneSurface(Problem):
         """
         scene, goal, first = self.scene, grey(self.target.numpy()), self.stages[0]
         spans = min(n - p for n, p in zip(first.control, scene.lens.degree, strict=True))
-        cells = transport_cells(max(s.rays for s in self.stages), not scene.source.collimated, spans)
+        cells = transport_cells(max(s.rays for s in self.stages), not scene.source.collimated, spans, self.effort.source_cells)
         spread = source_spread(scene) if first.spread else None
         if spread is not None:
             light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
@@ -355,7 +356,7 @@ class OneSurface(Problem):
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
         """`transport` of the light of a scene to an irradiance on its screen, with this number of source cells."""
-        return first_surface(scene, goal, self.field(0), cells, fixed, seconds)
+        return first_surface(scene, goal, self.field(0), cells, fixed, seconds, self.effort.vertex_cells)
 
     # Messages
 
@@ -368,7 +369,7 @@ class OneSurface(Problem):
             yield coarse
         seen = Resolution.before(self.scene, size)
         yield from self.resolution_notes(seen)
-        if words := self.source_limits(SMOOTH_STEPS if timed else None).sentence():
+        if words := self.source_limits(timed).sentence():
             yield words
         if seen.matters and without_waves and self.refines_waves:
             yield f"the wave image is not refined: {without_waves}"
@@ -397,17 +398,15 @@ class OneSurface(Problem):
     one_scene = True
 
     @cached_property
-    def _limits(self) -> dict[int | None, SourceLimits]:
+    def _limits(self) -> dict[int, SourceLimits]:
         return {}
 
-    def source_limits(self, steps: int | None = None) -> SourceLimits:
-        """The limits set by the source, which are the same for any lens: computed once; steps: as of `performance_limits`."""
+    def source_limits(self, timed: bool = False) -> SourceLimits:
+        """The limits set by the source, which are the same for any lens: computed once; timed: under a time limit."""
+        steps = SMOOTH_STEPS if timed else self.effort.bound_steps
         if steps not in self._limits:
             self._limits[steps] = performance_limits(self.scene, self.target.cpu().numpy(), steps)
         return self._limits[steps]
-
-    #: Rays of an evaluation.
-    final_rays = FINAL_RAYS
 
     @property
     def further_retraces(self) -> float:
@@ -424,11 +423,11 @@ class OneSurface(Problem):
             size: width and height of the picture, mm; timed: under a time limit, do not increase the number of rays, and limit the
                 iterations for the least error.
         """
-        evaluation = LensEvaluation(designer, state, self.final_rays, size, timed)
+        evaluation = LensEvaluation(designer, state, size, timed)
         if self.one_scene:
             evaluation.compare_with_start()
         evaluation.compare_unrounded()
-        bounds = self.source_limits(SMOOTH_STEPS if timed else None)
+        bounds = self.source_limits(timed)
         evaluation.figures |= {
             key: bound
             for key, bound in (("least_relative_rms", bounds.error), ("etendue_limit", bounds.etendue))

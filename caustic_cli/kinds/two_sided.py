@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config.default_stages import TWO_SIDED_SPANS, refinement_spans, two_sided
+from caustic_cli.config.default_stages import refinement
 from caustic_cli.config.settings import Settings
 from caustic_cli.config.table import LensSettings, ScreenSettings, check
 from caustic_cli.errors import InputError
@@ -73,7 +73,7 @@ class TwoSides(SeveralSurfaces):
         cls.complete_control(d)
         d.fill_design(preconditioner="laplacian")
         if not d.complete_given_stages():
-            d.set_stages(two_sided(d.lens.control, d.rays, d.resolution, d.quality))
+            d.set_stages(refinement(d.lens.control, d.rays, d.resolution, d.effort.system))
         elif any(stage.get(key) for stage in d.design.stages for key in ("waves", "spread")):
             raise InputError(
                 "[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread"
@@ -81,7 +81,7 @@ class TwoSides(SeveralSurfaces):
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:
-        return [min(TWO_SIDED_SPANS, refinement_spans(max(d.resolution), d.quality)) + p for p in d.lens.degree]
+        return [d.effort.system.spans(max(d.resolution)) + p for p in d.lens.degree]
 
     @property
     def half_sizes(self) -> list[tuple[float, float]]:
@@ -118,7 +118,7 @@ class TwoSides(SeveralSurfaces):
     def evaluate(self, designer: Designer, state: State, size: tuple[float, float], timed: bool = False) -> Evaluated:
         """By the picture, and a second picture or the ray directions behind it."""
         target, field, seed = self.target.numpy(), designer.field(state.stage), self.options.seed
-        farther, final = None if self.second_target is None else self.second_target.numpy(), self.final_rays
+        farther, final = None if self.second_target is None else self.second_target.numpy(), self.effort.final_rays
 
         def trace(heights: Tensor, rays: int) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
             scene, exit = split_heights(self.scene, field, heights)

@@ -35,6 +35,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import CHUNK, Tracer
 from caustic_cli.scene import Scene, Source
+from caustic_cli.scene.screen import Window, passed_by
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.several import Several
 
@@ -80,8 +81,17 @@ class Misalignment:
         """Centre, mm, and axes of the screen in the frame of the lens."""
         s, pose = scene.screen, self.lens_pose(scene)
         tilt = (s.tilt[0] + self.screen_tilt[0], s.tilt[1] + self.screen_tilt[1])
-        middle = self.point(scene, (s.shift[0] + self.screen_shift[0], s.shift[1] + self.screen_shift[1], s.z + self.throw))
-        return middle, tuple(rotate_to_local(pose, axis) for axis in Pose(tilt=tilt).axes)
+        centre = (s.shift[0] + self.screen_shift[0], s.shift[1] + self.screen_shift[1], s.z + self.throw)
+        axes = tuple(rotate_to_local(pose, s.in_space(axis)) for axis in Pose(tilt=tilt).axes)
+        return self.point(scene, s.in_space(centre)), axes
+
+    def windows(self, scene: Scene) -> list[Window]:
+        """The windows in front of the screen in the frame of the lens."""
+        pose = self.lens_pose(scene)
+        return [
+            replace(w, vertex=self.point(scene, w.vertex), axes=cast(Any, tuple(rotate_to_local(pose, axis) for axis in w.axes)))
+            for w in scene.screen.windows
+        ]
 
     def scene(self, scene: Scene) -> Scene:
         """The scene with the erroneous index, source position and source size, in the frame of the lens; the direction of light
@@ -133,7 +143,7 @@ class Misalignment:
             ahead = rotate_to_local(self.lens_pose(scene), rotate_to_global(Pose(tilt=self.source_tilt), (0.0, 0.0, 1.0)))
             reach = abs(z - scene.lens.offset.thickness)  # light from a mirror returns, with the same lateral shift
             x, y = x - reach * ahead[0] / ahead[2], y - reach * ahead[1] / ahead[2]
-        return replace(changed, screen=replace(scene.screen, z=z, shift=(x, y)))
+        return replace(changed, screen=replace(scene.screen, z=z, shift=scene.screen.in_space((x, y, z))[:2]))
 
     def brightness(self, scene: Scene, changed: Scene) -> float:
         """Factor of the power, of a scene with a single source, that keeps the irradiance of a beam with a profile, of which
@@ -184,7 +194,7 @@ def landing_points(
         requests: of the plan of the nominal scene.
     """
     changed = errors.scene(scene)
-    (point, axes), shape = errors.screen(scene), shape_of(scene.screen)
+    (point, axes), shape, windows = errors.screen(scene), shape_of(scene.screen), errors.windows(scene)
     parameters = {EXIT: heights + errors.thickness}
     with torch.no_grad():
         for band, plain in zip(changed.bands, scene.bands, strict=True):
@@ -202,6 +212,7 @@ def landing_points(
                 for out in tracer(parameters):
                     middle = (point[0], point[1], point[2] - out.datum)
                     x, y, there = shape.land(tracer.backend, out.origin, out.direction, middle, axes, forward)
+                    there = there & passed_by(windows, (*out.origin[:2], out.origin[2] + out.datum), out.direction)
                     power = torch.where(there, out.power, torch.zeros_like(out.power)) * scale
                     yield LandingPoints(x.double(), y.double(), power.double(), band.channel)
 

@@ -20,6 +20,7 @@ from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.screen_shape import PlaneScreen, shape_of
 from caustic_cli.optics.system import PlacedScreen, System
 from caustic_cli.scene import Screen
+from caustic_cli.scene.screen import Window, passed_by
 
 #: Cosine between a screen's normal and the axis from which on it counts as perpendicular to the axis.
 ACROSS = 1.0 - 1e-12
@@ -34,10 +35,11 @@ def dot(a: Vector, b: Vector) -> float:
 
 @dataclass(frozen=True)
 class NormalPlane:
-    """A plane normal to the light: its frame (e1, e2, e3) and Z, mm; see the module."""
+    """A plane normal to the light: its frame (e1, e2, e3) and Z, mm, see the module; and the windows in front of it."""
 
     axes: Axes
     z: float
+    windows: tuple[Window, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Receiver:
         """That of a screen on a straight axis: it is tilted and curved about its own centre."""
         if screen.upright:
             return cls(screen, (0.0, 0.0, screen.z), IDENTITY, (0.0, 0.0), screen.low, axis, shape_of(screen))
-        return cls.centred(screen, (*screen.shift, screen.z), screen.axes, axis)
+        return cls.centred(screen, screen.centre, screen.axes, axis)
 
     @classmethod
     def centred(cls, screen: Screen, centre: Vector, axes: Axes, axis: Vector) -> Receiver:
@@ -97,7 +99,7 @@ class Receiver:
     def land(self, backend, rays: RayState) -> tuple[RayState, Tensor]:
         """Ray transfer to it: the rays, expanded, with the screen's coordinates, mm, for x and y of their origins; and whether they
         arrive, (N,)."""
-        rays = rays.expanded()
+        rays = self._through_windows(rays.expanded())
         point = (self.middle[0], self.middle[1], self.middle[2] - rays.datum)
         forward = 1.0 if dot(self.axis, self.axes[2]) >= 0 else -1.0
         x, y, arrives = self.shape.land(backend, rays.origin, rays.direction, point, self.axes, forward)
@@ -108,17 +110,26 @@ class Receiver:
         on_it.lose("off_screen", (rays.power - weight).detach())
         return on_it, arrives
 
+    def _through_windows(self, rays: RayState) -> RayState:
+        """The rays with the power of those that pass the windows in front of it."""
+        if not self.screen.windows:
+            return rays
+        passed = passed_by(self.screen.windows, (*rays.origin[:2], rays.origin[2] + rays.datum), rays.direction)
+        through = replace(rays, power=torch.where(passed, rays.power, torch.zeros_like(rays.power)), lost=dict(rays.lost))
+        through.lose("missed_surface", (rays.power - through.power).detach())
+        return through
+
     @cached_property
     def plane(self) -> NormalPlane:
         """The plane through its centre normal to the axis; its own plane if that is normal to the axis."""
         (u, _, n), axis = self.axes, self.axis
         if self.across:
-            return NormalPlane(self.axes, dot(self.middle, n))
+            return NormalPlane(self.axes, dot(self.middle, n), self.screen.windows)
         x, y, z = (a - dot(u, axis) * b for a, b in zip(u, axis, strict=True))
         size = math.sqrt(dot((x, y, z), (x, y, z)))
         e1 = (x / size, y / size, z / size)
         e2 = (axis[1] * e1[2] - axis[2] * e1[1], axis[2] * e1[0] - axis[0] * e1[2], axis[0] * e1[1] - axis[1] * e1[0])
-        return NormalPlane((e1, e2, axis), dot(self.middle, axis))
+        return NormalPlane((e1, e2, axis), dot(self.middle, axis), self.screen.windows)
 
     @property
     def across(self) -> bool:

@@ -107,7 +107,7 @@ def points_in_space(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.nd
     """Points of a screen in space, mm, from its own coordinates x, y, mm, measured from its centre."""
     shape, (ax, ay, n) = shape_of(screen), screen.axes
     s = shape.at(x, y)[0]
-    px, py, pz = (m + x * a + y * b + s * c for m, a, b, c in zip((*screen.shift, screen.z), ax, ay, n, strict=True))
+    px, py, pz = (m + x * a + y * b + s * c for m, a, b, c in zip(screen.centre, ax, ay, n, strict=True))
     return px, py, pz
 
 

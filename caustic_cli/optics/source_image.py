@@ -28,7 +28,8 @@ SOURCE_IMAGES = Capability(
     dict.fromkeys(("separate places", "several sources"), "its places have images of their own")
     | {"ray file": "its rays have no common image"}
     | dict.fromkeys(
-        ("other elements", "designed entrance", "gradient index"), "one refraction behind a flat entrance does not give the image"
+        ("other elements", "folded axis", "designed entrance", "gradient index"),
+        "one refraction behind a flat entrance does not give the image",
     ),
 )
 

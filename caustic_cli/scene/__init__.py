@@ -4,6 +4,7 @@ here."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
 from caustic_cli.errors import InputError
@@ -11,6 +12,7 @@ from caustic_cli.scene import sources
 from caustic_cli.scene.aperture import Aperture, CircularAperture, Pupil
 from caustic_cli.scene.elements import (
     BESIDE_ELEMENTS,
+    BESIDE_LENSES,
     COMPONENTS,
     Component,
     FoldMirror,
@@ -101,6 +103,8 @@ class Scene:
         if self.elements:
             BESIDE_ELEMENTS.refuse(self)
             check_positions(self.elements, (self.lens.z_in, self.lens.offset.thickness), self.source.nearest, self.screen.z)
+            if self.unfolded is self:
+                BESIDE_LENSES.refuse(self)
 
     @property
     def second_setting(self) -> str:
@@ -116,6 +120,15 @@ class Scene:
     def behind(self) -> tuple[Component, ...]:
         """The elements behind the lens."""
         return self.elements[len(self.in_front) :]
+
+    @cached_property
+    def unfolded(self) -> Scene:
+        """The equivalent scene with a straight axis and without other elements, its screen as seen in the mirrors, if the other
+        elements only fold the axis; itself otherwise."""
+        mirrors = [e for e in self.elements if isinstance(e, FoldMirror) and e.flat]
+        if not mirrors or len(mirrors) < len(self.elements):
+            return self
+        return replace(self, elements=(), screen=reduce(lambda screen, mirror: mirror.shows(screen), mirrors, self.screen))
 
     @property
     def free_surfaces(self) -> tuple[str, ...]:

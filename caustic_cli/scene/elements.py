@@ -23,6 +23,7 @@ from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of
 from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.interaction import Reflecting, Refracting
 from caustic_cli.scene.materials import refractive_index
+from caustic_cli.scene.screen import Screen, Window, tilted
 from caustic_cli.scene.traits import Capability
 
 #: Largest semi-aperture of a sphere, as a fraction of its radius: beyond it light arrives near grazing incidence.
@@ -208,6 +209,19 @@ class FoldMirror(Component):
         """Folded."""
         return leg.folded(self.z, self.tilt)
 
+    @property
+    def flat(self) -> bool:
+        """Whether folding the axis is all that it does."""
+        return math.isinf(self.radius[0]) and self.free == "none"
+
+    def shows(self, screen: Screen) -> Screen:
+        """A screen as seen in it, from one as seen in the mirrors in front of it."""
+        x, y, normal = map(screen.in_space, tilted(self.tilt))
+        window = Window(screen.in_space((0.0, 0.0, self.z)), (x, y, normal), self.opening)
+        about_x, about_y = map(bool, self.tilt)  # the axis in the plane of the fold is reversed
+        mirrored = screen.mirrored[0] != about_y, screen.mirrored[1] != about_x
+        return replace(screen, mirrored=mirrored, windows=(*screen.windows, window))
+
 
 #: Components by their names among the settings.
 COMPONENTS: dict[str, type[Component]] = {shape.interaction.kind: shape for shape in (Component, FoldMirror)}
@@ -256,6 +270,6 @@ BESIDE_ELEMENTS = Capability(
     {
         **dict.fromkeys(("mirror", "gradient index", "lenslet array"), "⟨{setting}⟩" + NOT_BESIDE),
         "two sides": "⟨{scene.second_setting}⟩" + NOT_BESIDE,
-        "ray file": "⟨source.type⟩ rays" + NOT_BESIDE,
     },
 )
+BESIDE_LENSES = Capability("other lenses and curved mirrors", {"ray file": "⟨source.type⟩ rays" + NOT_BESIDE})

@@ -8,12 +8,17 @@ for an upright screen.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import and_, mul
+from typing import Any
 
 import numpy as np
 
 from caustic_cli.config.table import check_all, default
 from caustic_cli.errors import InputError, at_least
+from caustic_cli.scene.aperture import Aperture
 
 #: Largest number of points of a measured shape along an axis.
 MAX_SAGS = 4096
@@ -50,6 +55,31 @@ class Sags:
 
 
 @dataclass(frozen=True)
+class Window:
+    """An opening in a plane: that of a mirror in which a screen is seen.
+
+    Args:
+        vertex: its centre, mm; axes: unit vectors along its x, along its y, normal to it.
+        opening: its aperture.
+    """
+
+    vertex: tuple[float, float, float]
+    axes: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    opening: Aperture
+
+    def passed(self, origin: Sequence[Any], direction: Sequence[Any]) -> Any:
+        """Whether straight rays pass it, (N,): three components of their origins, mm, and directions, each (N,) or a number."""
+        away = [o - v for o, v in zip(origin, self.vertex, strict=True)]
+        (x, y, z), (dx, dy, dz) = ([sum(map(mul, axis, vector)) for axis in self.axes] for vector in (away, direction))
+        return self.opening.contains(x - z / dz * dx, y - z / dz * dy)
+
+
+def passed_by(windows: Iterable[Window], origin: Sequence[Any], direction: Sequence[Any]) -> Any:
+    """Whether rays pass all windows; arguments as of `Window.passed`.  True without any."""
+    return reduce(and_, (window.passed(origin, direction) for window in windows), True)
+
+
+@dataclass(frozen=True)
 class Screen:
     """Pixels [i, j], i along +x, j along +y, on [-R_x, R_x] x [-R_y, R_y] at z (thesis 3.1.1).
 
@@ -73,6 +103,11 @@ class Screen:
     radius: tuple[float, float] = PLANE
     #: A measured shape instead.
     sags: Sags | None = None
+    #: Whether its x and y point against those of the scene, as of a screen that is seen in a mirror; tilt and shift refer to its
+    #: own.
+    mirrored: tuple[bool, bool] = (False, False)
+    #: What light has to pass on its way to it.
+    windows: tuple[Window, ...] = ()
 
     def __post_init__(self):
         check_all("screen", self, "size", "z", "resolution", "tilt", "shift")
@@ -98,8 +133,8 @@ class Screen:
 
     @property
     def upright(self) -> bool:
-        """Whether it is plane and perpendicular to the axis."""
-        return not (self.curved or any(self.tilt))
+        """Whether it is plane, perpendicular to the axis and not seen in mirrors."""
+        return not (self.curved or any(self.tilt) or self.windows)
 
     @property
     def uncurved(self) -> Screen:
@@ -152,7 +187,18 @@ class Screen:
     @property
     def axes(self) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
         """Unit vectors along its x and y axes, and its unit normal."""
-        return tilted(self.tilt)
+        x, y, z = (self.in_space(axis) for axis in tilted(self.tilt))
+        return x, y, z
+
+    @property
+    def centre(self) -> tuple[float, float, float]:
+        """Its centre in the scene, mm."""
+        return self.in_space((*self.shift, self.z))
+
+    def in_space(self, own: tuple[float, float, float]) -> tuple[float, float, float]:
+        """A vector in the scene, from its components along the axes of the screen before its tilt; and the other way round."""
+        x, y = (-c if reversed else c for c, reversed in zip(own[:2], self.mirrored, strict=True))
+        return x, y, own[2]
 
 
 def tilted(tilt: tuple[float, float]) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:

@@ -1,6 +1,6 @@
 """Comparison of network architectures by a grid search (outlook of the thesis, 7.2).
 
-All candidates are trained for the same numbers of iterations, in ROUNDS, on the same picture from the same initial lens, and their
+All candidates are trained for the same numbers of iterations, in rounds, on the same picture from the same initial lens, and their
 lenses are retraced with the same independent rays.  So errors are reproducible, and times are not; a time limit ends the study
 after a complete round.
 """
@@ -16,11 +16,10 @@ from matplotlib.figure import Figure
 
 from caustic_cli import __version__
 from caustic_cli.config import checks
+from caustic_cli.effort import current_effort
 from caustic_cli.errors import CausticError
 from caustic_cli.studies.report import Study, plain_ticks, styles
 
-#: Total iterations after each round.
-ROUNDS = (25, 50, 100, 200)
 #: Seconds for each candidate, unless said.
 SECONDS = 4.0
 
@@ -84,8 +83,8 @@ def run_architectures(
         CausticError: none of them can be trained.
     """
     seconds = checks.number("⟨seconds⟩", SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)
-    began, rows, left, failed = time.monotonic(), [], list(candidates), {}
-    for k, iterations in enumerate(ROUNDS):
+    began, rows, left, failed, rounds = time.monotonic(), [], list(candidates), {}, current_effort().training_rounds
+    for k, iterations in enumerate(rounds):
         for i, c in enumerate(list(left)):
             try:
                 c.reach(iterations)
@@ -94,7 +93,7 @@ def run_architectures(
                 failed[c.about["series"]] = str(error)
                 left.remove(c)
             if progress is not None:
-                progress(k * len(candidates) + i + 1, len(ROUNDS) * len(candidates))
+                progress(k * len(candidates) + i + 1, len(rounds) * len(candidates))
         if not left or time.monotonic() - began > seconds * len(candidates):
             break
     if not any(_in_grid(c.about) for c in left):
@@ -103,7 +102,7 @@ def run_architectures(
     made = {
         "version": __version__,
         "seconds_each": seconds,
-        "rounds": list(ROUNDS),
+        "rounds": list(rounds),
         "failed": failed,
         "threads": torch.get_num_threads(),
         "reference_error": 0.0,

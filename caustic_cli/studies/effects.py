@@ -22,6 +22,7 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.config import checks
+from caustic_cli.effort import STANDARD, Effort, current_effort
 from caustic_cli.optics.effects import EFFECTS, Decision, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.image import Image
@@ -35,8 +36,6 @@ from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, Study
 
-#: Default number of rays and of rounds: a few seconds for each effect on two cores.  A wave image alone takes seconds.
-RAYS, REPEATS, WAVE_REPEATS = 1 << 16, 5, 2
 BY_NAME = {effect.name: effect for effect in EFFECTS}
 #: Whether leaving out an effect saves no time.
 FREE = {effect.name: effect.free for effect in EFFECTS}
@@ -63,9 +62,7 @@ COLUMNS = {
 }
 
 
-def measure_waves(
-    plan: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = WAVE_REPEATS, seed: int = 0
-) -> dict:
+def measure_waves(plan: Plan, field: HeightField, heights: Tensor, *, rays: int, repeats: int, seed: int = 0) -> dict:
     """`measure` for an effect of the wave image alone: its whole time is the cost, and the error is that of the ray image."""
     times, light, clock = [], None, _clock(heights)
     for _ in range(repeats):
@@ -99,8 +96,8 @@ def measure(
     field: HeightField,
     heights: Tensor,
     *,
-    rays: int = RAYS,
-    repeats: int = REPEATS,
+    rays: int,
+    repeats: int,
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> dict:
@@ -140,7 +137,8 @@ def explain(
     field: HeightField,
     heights: Tensor,
     *,
-    rays: int = RAYS,
+    rays: int,
+    effort: Effort = STANDARD,
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> list[dict]:
@@ -165,9 +163,9 @@ def explain(
                 for chosen in (set(plan.simulated) | {effect.name}, set(plan.simulated) - {effect.name})
             )
             found = (
-                measure_waves(with_, field, heights, rays=rays, seed=seed)
+                measure_waves(with_, field, heights, rays=rays, repeats=effort.wave_rounds, seed=seed)
                 if WAVES[effect.name]
-                else measure(with_, without, field, heights, rays=rays, repeats=REPEATS, seed=seed, dtype=dtype)
+                else measure(with_, without, field, heights, rays=rays, repeats=effort.effect_rounds, seed=seed, dtype=dtype)
             )
             scale = 0.0 if FREE[effect.name] else 1e3
             cost, *extremes = (scale * found[k] for k in ("seconds", "seconds_min", "seconds_max"))
@@ -222,8 +220,12 @@ def run_effects(
     Raises:
         InputError: numbers out of range.
     """
-    rays = checks.whole("⟨rays⟩", RAYS if rays is None else rays, 256, 1 << 32)
-    rounds = [checks.whole("⟨repeats⟩", usual if repeats is None else repeats, 1, 1000) for usual in (REPEATS, WAVE_REPEATS)]
+    effort = current_effort()
+    rays = checks.whole("⟨rays⟩", effort.effect_rays if rays is None else rays, 256, 1 << 32)
+    rounds = [
+        checks.whole("⟨repeats⟩", usual if repeats is None else repeats, 1, 1000)
+        for usual in (effort.effect_rounds, effort.wave_rounds)
+    ]
     heights = heights.detach().double()
     plan, rows = compile_plan(scene, field, heights), []
     for k, effect in enumerate(plan.effects):

@@ -17,12 +17,13 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.config import checks
+from caustic_cli.effort import current_effort
 from caustic_cli.errors import CausticError
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 from caustic_cli.studies.fit import pareto
 from caustic_cli.studies.report import Study, legend_beside, styles
-from caustic_cli.studies.retrace import FINAL_RAYS, retrace
+from caustic_cli.studies.retrace import retrace
 
 #: Least range of the efficiency axis, percentage points.
 LEAST_SPAN = 0.1
@@ -81,7 +82,8 @@ def run_efficiency(
     """
     rows: list[dict] = []
     for k, lens in enumerate(lenses):
-        traced = checks.whole("⟨rays⟩", min(FINAL_RAYS, RAYS_PER_PIXEL * lens.target.size) if rays is None else rays, 256, 1 << 32)
+        usual = min(current_effort().final_rays, RAYS_PER_PIXEL * lens.target.size)
+        traced = checks.whole("⟨rays⟩", usual if rays is None else rays, 256, 1 << 32)
         _, figures = retrace(lens.scene, lens.field, lens.heights, lens.target, rays=traced, seed=seed, device=device)
         rows.append(
             {

@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import SOFTWARE, write_bytes
 from caustic_cli.optics import curvature
@@ -33,8 +34,6 @@ from caustic_cli.scene.traits import Capability
 MOST, A_SPAN = 2001, 4
 #: Rows of points evaluated at a time.
 ROWS = 64
-#: Rays of the sensitivities and of the angles inside the lens.
-RAYS = 100_000
 #: Thickness of common sheet material, in parts of the width of the plate.
 SHEET = 0.08
 #: Finite-difference steps of the sensitivities: of the throw, relative; of the index.
@@ -225,7 +224,8 @@ def _landings(scene: Scene, field: HeightField, heights: Tensor, seed: int, furt
 
 
 def _rays(scene: Scene, seed: int):
-    return rays_of(scene, "stratified", RAYS, stream(seed, "report")).chunks(RAYS)
+    rays = current_effort().sensitivity_rays
+    return rays_of(scene, "stratified", rays, stream(seed, "report")).chunks(rays)
 
 
 def write_json(path: str | Path, figures: dict) -> None:

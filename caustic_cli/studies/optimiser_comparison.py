@@ -20,10 +20,11 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.config import checks
+from caustic_cli.effort import current_effort
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 from caustic_cli.studies.report import Study, draw_front, legend_beside, plain_ticks
-from caustic_cli.studies.retrace import FINAL_RAYS, retrace
+from caustic_cli.studies.retrace import retrace
 
 #: Time slices per run; a power of 2.
 ROUNDS = 16
@@ -105,7 +106,8 @@ def run_comparison(
         CausticError: no light reaches the screen.
     """
     seconds = checks.number("⟨seconds⟩", SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)
-    rays = checks.whole("⟨rays⟩", min(FINAL_RAYS, RAYS_PER_PIXEL * target.size) if rays is None else rays, 256, 1 << 32)
+    usual = min(current_effort().final_rays, RAYS_PER_PIXEL * target.size)
+    rays = checks.whole("⟨rays⟩", usual if rays is None else rays, 256, 1 << 32)
     tables: list[list[dict]] = [[] for _ in runs]
 
     def evaluate() -> None:

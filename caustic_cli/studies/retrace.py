@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.effort import STANDARD
 from caustic_cli.errors import CausticError
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import Rays, rays_of
@@ -24,12 +25,8 @@ from caustic_cli.studies.irradiance import irradiance_figures, source_figures, u
 from caustic_cli.studies.metrics import figures_of_merit
 from caustic_cli.studies.noise import black_error, image_noise, noise_bias, standard_error, variance_of
 
-#: Rays of the final retrace of a design.
-FINAL_RAYS = 4_000_000
-#: Pixels for which these suffice where the noise is not corrected for, and the largest factor for more pixels.
+#: Pixels for which the rays of an evaluation suffice where the noise is not corrected for, and the largest factor for more pixels.
 FINAL_PIXELS, MOST_FINAL = 250 * 250, 16
-#: Default largest noise of relative_rms, as a fraction of it.
-RELATIVE_NOISE = 0.1
 #: Independent images whose variance estimates the noise of their mean: four suffice over thousands of pixels.
 BATCHES = 4
 #: Largest factor by which the number of rays is increased to reduce the noise of a figure.
@@ -226,8 +223,11 @@ def _in_halves(
             return counted, figures
 
 
-def evaluation_rays(scene: Scene, usual: int = FINAL_RAYS) -> int:
-    """Rays of the evaluation of a design: for a plane wave, whose noise is not corrected for, in proportion to the pixels."""
+def evaluation_rays(scene: Scene, usual: int = STANDARD.final_rays) -> int:
+    """Rays of the evaluation of a design: for a plane wave, whose noise is not corrected for, in proportion to the pixels.
+
+    usual: for 250 x 250 pixels.
+    """
     times = math.prod(scene.screen.resolution) / FINAL_PIXELS if scene.source.collimated else 1.0
     return round(usual * min(max(1.0, times), MOST_FINAL))
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,10 +30,10 @@ from torch import Tensor
 from caustic_cli.errors import CausticError
 from caustic_cli.io.files import SOFTWARE, atomic_file
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.frames import AxisSegment
+from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import System
+from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
 from caustic_cli.scene.traits import BEYOND_CLEAR, Capability
@@ -51,10 +52,14 @@ NORMAL, CHI2, LARGEST = 0.0027, 0.05, 7.0
 LIGHT, LEAK = 4.0, 5e-5
 #: Tolerance for a better correlation of a flipped image, which for symmetric pictures differs by noise alone.
 TIE = 1e-2
+#: What is traced of a lens beyond a clear one.
+TRACED = ("mirror", "several wavelengths", "tilted screen", "shifted screen")
 VERIFICATION = Capability(
     "comparison with Mitsuba",
     {
-        **dict.fromkeys(BEYOND_CLEAR, "⟨verify⟩ mitsuba traces clear lenses and straight screens, not {}"),
+        **dict.fromkeys(
+            [name for name in BEYOND_CLEAR if name not in TRACED], "⟨verify⟩ mitsuba traces clear lenses and plane screens, not {}"
+        ),
         **dict.fromkeys(
             ("ray file", "several sources", "user-defined source"),
             "⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}",
@@ -89,8 +94,10 @@ class Agreement:
         return self.figures["agree"]
 
 
-def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int = 0) -> Agreement:
-    """Trace the lens here and the exported scene at `path` in Mitsuba, with about `rays` rays each, and compare.
+def verify(paths: Sequence[Path], scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int = 0) -> Agreement:
+    """Trace the lens here and its exported scenes in Mitsuba, with about `rays` rays each, and compare.
+
+    paths: of the scenes of its `bands`, one for each index; each is traced with its part of the rays.
 
     Raises:
         CausticError: no variant of Mitsuba works on this machine, or no light reaches the screen.
@@ -99,19 +106,23 @@ def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: 
     import mitsuba as mi  # noqa: PLC0415
 
     mi.set_log_level(mi.LogLevel.Error)
-    world = mi.load_file(str(path), optimize=False)  # optimising would merge entrance and exit into one unnamed mesh
-    image, squares = _trace(mi, world, scene, rays, seed)
+    image, squares = np.zeros((2, *scene.screen.resolution))
+    for k, (path, band) in enumerate(zip(paths, scene.bands, strict=True)):
+        world = mi.load_file(str(path), optimize=False)  # optimising would merge entrance and exit into one unnamed mesh
+        found = _trace(mi, world, band.scene, max(1, round(rays * band.weight)), [seed, 1, *([k] if k else [])])
+        image, squares = image + band.weight * found[0], squares + band.weight**2 * found[1]
     renders = np.array(
         [
-            expose(
-                scene, field, heights, rays_of(scene, "stratified", max(1, rays // BATCHES), stream(seed, f"verify {k}"))
-            ).image.numpy()
+            expose(scene, field, heights, rays_of(scene, "stratified", max(1, rays // BATCHES), stream(seed, f"verify {k}")))
+            .image.numpy()
+            .reshape(-1, *scene.screen.resolution)
+            .sum(0)
             for k in range(BATCHES)
         ]
     )
     if not (renders.sum() > 0 and image.sum() > 0):
         raise CausticError("no light reaches the screen, so there is nothing to verify")
-    shift = TURN * (scene.screen.z - scene.lens.z_in) / min(scene.screen.pixel)
+    shift = TURN * abs(scene.screen.z - scene.lens.z_in) / min(scene.screen.pixel)
     return compare(renders, image, squares, rays, shift, {"mitsuba": mi.__version__, "variant": variant})
 
 
@@ -137,19 +148,20 @@ def _choose_variant() -> str:
 # tracing
 
 
-def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _trace(mi, world, scene: Scene, rays: int, seed: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Power per pixel [i, j], as a fraction of the source's, and the sums of squares of the contributions of the rays."""
-    rng = np.random.default_rng([seed, 1])
+    rng = np.random.default_rng(seed)
     shapes = {shape.id(): shape for shape in world.shapes()}
     follow = _follow if "scalar" not in mi.variant() else _follow_scalar
     image, squares = np.zeros((2, *scene.screen.resolution))
     system = System.of(scene)
-    surfaces, leg = [(e.name, e.reflects) for e in system.elements], system.leg or AxisSegment()
+    receiver, own = Receiver.of(system, scene.screen), {EXIT: "mirror"} if scene.lens.mirror else {}  # the export's name of it
+    surfaces = [(own.get(e.name, e.name), e.reflects) for e in system.elements]
     for start, direction, share in sample_rays(scene, rays, rng):
         *points, weight = follow(mi, world, shapes, [*surfaces, ("screen", False)], start, direction)
-        x, y = (sum((p - o) * a for p, o, a in zip(points, leg.origin, axis, strict=True)) for axis in leg.frame[:2])
-        image += _binned(x, y, weight * share, scene)
-        squares += _binned(x, y, (weight * share) ** 2, scene)
+        x, y = (sum((p - o) * a for p, o, a in zip(points, receiver.middle, axis, strict=True)) for axis in receiver.axes[:2])
+        image += _binned(x, y, weight * share, receiver)
+        squares += _binned(x, y, (weight * share) ** 2, receiver)
     return image / rays, squares / rays**2
 
 
@@ -196,10 +208,10 @@ def _onwards(mi, hit, active, reflects: bool):
     return hit.spawn_ray(hit.to_world(sample.wo)), weight[0]
 
 
-def _binned(x: np.ndarray, y: np.ndarray, value: np.ndarray, scene: Scene) -> np.ndarray:
-    """Sum of `value` per pixel [i, j]."""
-    (nx, ny), (sx, sy) = scene.screen.resolution, scene.screen.half_size
-    i, j = np.floor((x / sx + 1) * nx / 2), np.floor((y / sy + 1) * ny / 2)
+def _binned(x: np.ndarray, y: np.ndarray, value: np.ndarray, receiver: Receiver) -> np.ndarray:
+    """Sum of `value` per pixel [i, j]; x, y: along the axes of the receiver from its `middle`, mm."""
+    nx, ny = receiver.resolution
+    i, j = (np.floor((c - low) / width) for c, low, width in zip((x, y), receiver.low, receiver.pixel, strict=True))
     inside = (i >= 0) & (i < nx) & (j >= 0) & (j < ny) & (value > 0)
     at = (i[inside] * ny + j[inside]).astype(np.int64)
     return np.bincount(at, value[inside], nx * ny).reshape(nx, ny)

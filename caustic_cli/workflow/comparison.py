@@ -12,9 +12,10 @@ from torch import Tensor
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
-from caustic_cli.config.default_stages import LEAST_CELLS, coarse_to_fine
+from caustic_cli.config.default_stages import coarse_to_fine
 from caustic_cli.config.design import stage_of
 from caustic_cli.config.settings import Settings
+from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import first_surface
@@ -140,7 +141,7 @@ def lens_of_disc() -> tuple[Scene, HeightField, Tensor]:
     full = complete({}, 1.0)
     scene = settings.build_scene(full)
     field = HeightField.of(scene.lens)
-    return scene, field, first_surface(scene, disc(scene, full.target.size), field, LEAST_CELLS).heights
+    return scene, field, first_surface(scene, disc(scene, full.target.size), field, current_effort().source_cells).heights
 
 
 def disc(scene: Scene, size: tuple[float, float]) -> np.ndarray:

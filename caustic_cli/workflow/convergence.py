@@ -6,7 +6,7 @@ What they are called and which options they take is known without torch: what a 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -108,6 +108,8 @@ class StudyKind:
         if asked.lens:
             others = ", ".join(kind.name for kind in STUDIES.values() if "other elements" not in kind.unsupported)
             self.capability.refuse(asked.lens.scene, study=self.name, others=others)
+            if "other elements" in self.unsupported:
+                asked = replace(asked, lens=replace(asked.lens, scene=asked.lens.scene.unfolded))
         compile_usual(asked.device, asked.say)
         return self.run(asked)
 

@@ -49,6 +49,8 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
     discard(project.path / FARTHER)
     if evaluated.farther is not None:
         write_image(project.path / FARTHER, evaluated.farther[0], white_level(*evaluated.farther), encoding, WIDE)
+    if not designer.problem.effort.report:
+        return evaluated
     history = np.array(state.history, dtype=float).reshape(-1, 5)
     surface = _surface(designer.field(evaluated.state.stage), designer.exit(evaluated.state))
     design_report.write_report(
@@ -74,7 +76,7 @@ def expected_seconds(designer: Designer, state: State) -> float:
     retrace(
         *trace_arguments(scene, field, state.heights),
         target,
-        rays=evaluation_rays(scene, problem.final_rays) // PROBE,
+        rays=evaluation_rays(scene, problem.effort.final_rays) // PROBE,
         device=problem.device,
         noise=False,
     )
@@ -92,12 +94,11 @@ def expected_seconds(designer: Designer, state: State) -> float:
 def evaluation_seconds(designer: Designer, state: State) -> float:
     """Rough time of `evaluate_and_write`, s, without a probe: an iteration takes BACKWARD times as long as its image alone."""
     history, seconds = np.array(state.history, dtype=float).reshape(-1, 5), {}
+    rays = evaluation_rays(designer.scene, designer.problem.effort.final_rays)
     for k, stage in enumerate(designer.stages):
         times = history[history[:, 1] == k, 4]
         if len(times) > 1:
-            images = (
-                WAVE_IMAGES if stage.waves else RETRACES * evaluation_rays(designer.scene, designer.problem.final_rays) / stage.rays
-            )
+            images = WAVE_IMAGES if stage.waves else RETRACES * rays / stage.rays
             seconds[bool(stage.waves)] = images * float(np.median(np.diff(times))) / BACKWARD  # by the last stage of each kind
     return REPORT_SECONDS + sum(seconds.values())
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config import checks, keywords
+from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.export import format_of
 from caustic_cli.inverse.designer import State
@@ -28,7 +29,7 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import judged
-from caustic_cli.studies.retrace import FINAL_RAYS, RELATIVE_NOISE, evaluation_rays, retrace
+from caustic_cli.studies.retrace import evaluation_rays, retrace
 from caustic_cli.studies.waves import height_deviation, wave_figures
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.export import Exporter
@@ -151,7 +152,7 @@ class Lens:
 
         Args:
             rays: their number; with `tolerance`, the initial one.  None for those of the evaluation of a design,
-                `evaluation_rays`, of other light than a plane wave's more until the noise is `RELATIVE_NOISE`.
+                `evaluation_rays`, of other light than a plane wave's more until its noise is a tenth of the error.
             seed: of the rays, that of the design unless given.
             tolerance: relative RMS noise of the image, for which the number of rays is increased.
             filter: reconstruction filter; None for a bincount.
@@ -166,14 +167,15 @@ class Lens:
         """
         lens = self.under(_other_scene(given, signature(Lens.render).parameters))
         plan = effects if isinstance(effects, Plan) else lens.plan(effects)
+        effort = current_effort()
         compile_for(plan.scene, device, say or Listener(), plan.requests)
         exposure, figures = retrace(
             plan.scene,
             lens.field if cut is None else cut,
             lens.heights,
             lens.target,
-            rays=evaluation_rays(plan.scene, FINAL_RAYS) if rays is None else count(rays),
-            quiet=RELATIVE_NOISE if rays is None else None,
+            rays=evaluation_rays(plan.scene, effort.final_rays) if rays is None else count(rays),
+            quiet=effort.noise if rays is None else None,
             seed=lens.seed if seed is None else seed,
             filter=filter,
             tolerance=tolerance,

@@ -19,11 +19,8 @@ from caustic_cli import cli
 from caustic_cli.commands import export, render  # noqa: F401
 from caustic_cli.export import lighttools, stl  # noqa: F401
 from caustic_cli.inverse.designer import Designer
-from caustic_cli.kinds import OneSurface
-from caustic_cli.studies import design_report
 
 torch.set_num_threads(1)
-OneSurface.final_rays, design_report.write_report = 5000, lambda *args: None  # its drawing takes most of the time
 with open(sys.argv[1], "r+b") as f:
     board = mmap.mmap(f.fileno(), 0)
 run = Designer.run

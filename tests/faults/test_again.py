@@ -11,9 +11,8 @@ from helpers import write_blob
 from caustic_cli import cli, load
 from caustic_cli.errors import CausticError
 from caustic_cli.export import FORMATS
-from caustic_cli.kinds import OneSurface
 from caustic_cli.project import directory
-from caustic_cli.studies import design_report, report
+from caustic_cli.studies import report
 from caustic_cli.studies.report import Study
 from caustic_cli.workflow import design as workflow
 
@@ -29,8 +28,6 @@ def designed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("again")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(OneSurface, "final_rays", 2000)
-        patch.setattr(design_report, "write_report", lambda *args: None)
         write_picture()
         assert cli.run([*DESIGN, "--quiet", "--threads", "1"]) == 0
     return folder / "blob.caustic"

@@ -117,6 +117,9 @@ BAD = [
     RANKS | {"RANK": "2"},
     RANKS | {"MASTER_PORT": "x"},
     RANKS | {"MASTER_PORT": "70000"},
+    {"CAUSTIC_EFFORT": "superb"},
+    {"CAUSTIC_EFFORT": "test rays=3"},
+    {"CAUSTIC_EFFORT": "test final_rays"},
 ]
 
 

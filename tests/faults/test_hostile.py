@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import tomli_w
-from helpers import small_designs, write_blob
+from helpers import write_blob
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -35,7 +35,6 @@ def designed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("hostile")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        small_designs(patch, 2000)
         write_blob("blob.png", 16, (5, 6), 15.0)
         assert (
             cli.run(
@@ -400,7 +399,6 @@ def test_no_picture_beyond_the_project_is_opened(copy, capfd, file):
 
 def test_resuming_rewrites_no_picture(copy, capfd, monkeypatch):
     """project.toml may name a picture of the user's own; it is read."""
-    small_designs(monkeypatch, 2000)
     (copy / "mine.jpg").write_bytes(image("JPEG"))
     path = copy / "project.toml"
     path.write_text(path.read_text().replace('"target.png"', '"mine.jpg"'))

@@ -7,7 +7,6 @@ import shlex
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 
 from caustic_cli import cli
 from caustic_cli.errors import CausticError
@@ -176,7 +175,6 @@ def test_where_nothing_begins_it_stops_with_a_sentence():
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 10_000)
     np.save("spot.npy", np.eye(12))
     return tmp_path
 

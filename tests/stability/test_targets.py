@@ -7,7 +7,6 @@ import shlex
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -93,7 +92,6 @@ def test_transport_start(name, source):
 def test_designs_of_extreme_pictures_write_finite_files(tmp_path, monkeypatch, capfd):
     """The whole command: zeros and one bright pixel as 8-bit and 16-bit images and as .npy."""
     monkeypatch.chdir(tmp_path)
-    small_designs(monkeypatch, 10_000)
     spot = np.zeros((N, N))
     spot[4, 11] = 1.0
     Image.fromarray((255 * spot).astype(np.uint8)).save("spot8.png")

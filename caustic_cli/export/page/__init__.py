@@ -19,6 +19,7 @@ import json
 import math
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
@@ -110,6 +111,7 @@ def write_page(
         InputError: the page does not support the scene, see PAGE, or the file cannot be written.
     """
     PAGE.refuse(scene)
+    scene = scene.unfolded
     screen, kind = _coarser(scene.screen), scene.lens.kind
     data = {
         "title": title,
@@ -198,7 +200,7 @@ def _coarser(screen: Screen) -> Screen:
     """The screen with at most PIXELS pixels across."""
     factor = max(1.0, max(screen.resolution) / PIXELS)
     nx, ny = (max(1, round(n / factor)) for n in screen.resolution)
-    return Screen(screen.size, screen.z, (nx, ny), screen.tilt, screen.shift)
+    return replace(screen, resolution=(nx, ny))
 
 
 def _onto(image: np.ndarray, screen: Screen) -> np.ndarray:

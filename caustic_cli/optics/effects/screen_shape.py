@@ -25,7 +25,7 @@ def displacement(scene: Scene) -> float:
     point = np.stack(points_in_space(screen, x, y))
     way = point - np.array([0.0, 0.0, lens.offset.thickness])[:, None]
     axes = np.array(screen.axes)
-    back = axes[2] @ (point - np.array([*screen.shift, screen.z])[:, None]) / (axes[2] @ way)
+    back = axes[2] @ (point - np.array(screen.centre)[:, None]) / (axes[2] @ way)
     return float(np.hypot(*(back * (axis @ way) / w for axis, w in zip(axes[:2], screen.pixel, strict=True))).max())
 
 

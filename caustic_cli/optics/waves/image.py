@@ -95,6 +95,7 @@ class WaveImage:
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
     """Spectral lines of a scene, by wavelength and polarisation: its own, or the given ones with equal powers; white light if it
     has none."""
+    scene = scene.unfolded
     if len(scene.source.members) > 1:
         return [
             replace(line, part=fraction * line.part)
@@ -156,9 +157,10 @@ def wave_image(
     Raises:
         NoWaveImage: no light reaches the screen, rays cross in front of the reference plane, or memory or `most` is insufficient.
     """
+    scene = (scene if screen is None else scene.onto(screen)).unfolded
     lines = lines_of(scene, field, wavelengths)
     parameters = {EXIT: heights.double()}
-    return image_of(lines, parameters, screen or scene.screen, finer=finer, dtype=dtype, perturbation=perturbation, most=most)
+    return image_of(lines, parameters, scene.screen, finer=finer, dtype=dtype, perturbation=perturbation, most=most)
 
 
 def image_of(

@@ -39,6 +39,7 @@ from caustic_cli.optics.waves.interpolation import FineWavefront, Lit, extrapola
 from caustic_cli.optics.waves.ray_aiming import aimed_rays
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Pupil
+from caustic_cli.scene.screen import passed_by
 
 #: Points along each side of the pupil for a survey; fraction of rays outside the quantiles `mostly`.
 SURVEY, FEW = 65, 0.01
@@ -127,6 +128,7 @@ class Optics:
         qx, qy, qz = (sum(a * b for a, b in zip(d, e, strict=True)) for e in (e1, e2, e3))
         t = (self.plane.z - sum(a * b for a, b in zip(o, e3, strict=True))) / qz
         ahead = (t > 0) & torch.isfinite(t)
+        ahead = ahead & passed_by(self.plane.windows, o, d)
         t = torch.where(ahead, t, torch.zeros_like(t))
         big_x, big_y = (sum(a * b for a, b in zip(o, e, strict=True)) + t * q for e, q in ((e1, qx), (e2, qy)))
         n, far = self.index, self.distance

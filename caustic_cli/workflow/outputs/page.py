@@ -115,6 +115,7 @@ def _figure_rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _notes(plan: Plan) -> list[str]:
     missing = [MISSING[name] for name in plan.simulated if name not in TRACED]
+    missing += ["the edges of the mirrors behind the lens"] if plan.scene.elements else []
     notes = [f"Not traced on this page: {'; '.join(missing)}."] if missing else []
     if plan.scene.colored:
         notes.append("The picture is coloured; this page shows the light of all its colours together.")

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from caustic_cli.effort import current_effort
 from caustic_cli.io.picture import write_image
 from caustic_cli.project.project import FARTHER
-from caustic_cli.studies.retrace import FINAL_RAYS, white_level
+from caustic_cli.studies.retrace import white_level
 from caustic_cli.studies.second_target import second_figures
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
@@ -33,7 +34,7 @@ class SecondPicture(Output):
                 lens.field,
                 lens.heights,
                 target,
-                rays=FINAL_RAYS if rendering.rays is None else rendering.rays,
+                rays=current_effort().final_rays if rendering.rays is None else rendering.rays,
                 seed=rendering.seed,
                 device=rendering.device,
                 requests=rendering.plan.requests,

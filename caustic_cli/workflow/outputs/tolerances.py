@@ -62,16 +62,17 @@ class ToleranceAnalysis(Output):
         assert lens.target is not None
         sheet, plot = self.paths(rendering.place)
         refined = lens.figures.get("wave_relative_rms") is not None and plan["diffraction"].on
-        seen = Resolution.at(plan.scene, lens.field, lens.heights)
-        args, requests = (plan.scene, lens.field, lens.heights, lens.target, self.errors), plan.requests
+        scene = plan.scene.unfolded
+        seen = Resolution.at(scene, lens.field, lens.heights)
+        args, requests = (scene, lens.field, lens.heights, lens.target, self.errors), plan.requests
         with study.one_thread(), say.progress(None) as show:
-            near = seen.diffraction / max(plan.scene.screen.pixel) / 2.0
+            near = seen.diffraction / max(scene.screen.pixel) / 2.0
             trials = (
                 WaveTrials(*args, requests=requests, waves=_waves, near=near) if refined else study.Trials(*args, requests=requests)
             )
             found = study.study(trials, lambda what, done, whole: show("tolerances", what, done, whole))
         figures = study.figures(found)
-        figures["nominal"] |= source_figures(plan.scene, figures["nominal"]["on_target"])
+        figures["nominal"] |= source_figures(scene, figures["nominal"]["on_target"])
         study.write_csv(sheet, found)
         study.write_plot(plot, found)
         for name, why in found.unused.items():

@@ -9,13 +9,12 @@ from typing import Any, ClassVar
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies import verify
-from caustic_cli.workflow.export import at_own_wavelength
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.outputs.base import Output, Rendering
 
 
 class MitsubaComparison(Output):
-    """The comparison, at the index of a single wavelength."""
+    """The comparison."""
 
     option: ClassVar[str] = "verify"
     capability: ClassVar[Capability] = verify.VERIFICATION
@@ -28,11 +27,12 @@ class MitsubaComparison(Output):
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """verify: the figures of `studies.verify`, and image."""
-        scene, lens, (panels,) = at_own_wavelength(rendering.scene), rendering.lens, self.paths(rendering.place)
+        scene, lens, (panels,) = rendering.scene, rendering.lens, self.paths(rendering.place)
         with TemporaryDirectory() as folder:
-            path = Path(folder) / "lens.xml"
-            write_mitsuba(path, scene, lens.field, lens.heights, quick_samples(lens.field), dark=True)
-            found = verify.verify(path, scene, lens.field, lens.heights, rendering.count, rendering.seed)
+            paths = [Path(folder) / f"lens-{k}.xml" for k in range(len(scene.bands))]
+            for path, band in zip(paths, scene.bands, strict=True):
+                write_mitsuba(path, band.scene, lens.field, lens.heights, quick_samples(lens.field), dark=True)
+            found = verify.verify(paths, scene, lens.field, lens.heights, rendering.count, rendering.seed)
         verify.write_panels(panels, found, scene)
         return {"verify": found.figures | {"image": str(panels)}}
 

@@ -1,0 +1,186 @@
+"""What a quality means: how finely a design is computed and how thoroughly it is judged, on one page.
+
+The three qualities that a user can ask for, draft, standard and fine, differ in the default stages alone, which the project then
+contains; what follows from neither is the same for all.  TEST is standard in small, for tests of what is done with a design.  The
+environment's CAUSTIC_EFFORT names the effort of designs that ask for no quality, and of what no quality sets, with changes, such as
+"test report=True final_rays=200000".
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+from dataclasses import dataclass, replace
+
+from caustic_cli.errors import InputError
+
+#: (part of the rays of the last stage, iterations) of each stage.
+Plan = tuple[tuple[float, int], ...]
+
+
+@dataclass(frozen=True)
+class LargePictures:
+    """What is different for pictures with many pixels along an axis."""
+
+    #: Pixels beyond which pictures are large.
+    pixels: int
+    #: Knot spans along each axis; 1280 control points of degree 3 are a fast transform length.
+    spans: int = 1277
+    #: Rays per pixel and their largest number where these are more than those of other pictures.
+    rays_per_pixel: int = 0
+    most_rays: int = 0
+    #: All iterations with these rays, since with fewer the lens overfits the sampling noise; None for the plan of other pictures.
+    plan: Plan | None = None
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Default stages after an accurate initial surface."""
+
+    #: Knot spans along each axis per pixel of the picture: finer than it.
+    spans_per_pixel: float
+    #: Their largest number.
+    most_spans: int
+    #: Rays per pixel in the last stage: of a quadrature, whose noise a lens overfits with fewer.
+    rays_per_pixel: int
+    #: Their largest number, by the time of an iteration.
+    most_rays: int
+    #: Largest subdivision of pixels along each axis, by which the reconstruction filter is narrow.
+    subdivision: int
+    #: The stages.
+    plan: Plan
+    #: Least number of knot spans.
+    least_spans: int = 32
+    large: LargePictures | None = None
+
+    def large_at(self, pixels: int) -> LargePictures | None:
+        """What is different for `pixels` along the longer axis of the picture, if they are many."""
+        return self.large if self.large is not None and pixels > self.large.pixels else None
+
+    def spans(self, pixels: int) -> int:
+        """Knot spans along each axis of the lens for a screen of `pixels` pixels along its longer axis."""
+        if large := self.large_at(pixels):
+            return large.spans
+        return min(self.most_spans, max(self.least_spans, round(self.spans_per_pixel * pixels)))
+
+
+@dataclass(frozen=True)
+class Effort:
+    """The numbers that trade time for accuracy; limits and tolerances of algorithms stand in their own modules."""
+
+    # By quality: time limit and default stages
+
+    #: Time limit, s, from which this quality uses the time better than one before.
+    seconds: float
+    #: Iterations of each stage, and of the last, of a design from coarse to fine without an accurate initial surface.
+    coarse_to_fine: tuple[int, int]
+    #: After optimal transport.
+    refinement: Refinement
+    #: The same for pictures with gaps, where light through a crease falls into dark regions, and a crease is as narrow as the knot
+    #: spans and the cells of the start.  On such fine nets iterations gain little: with 10 spans per pixel two more iterations
+    #: improved thin lines from 0.094 to 0.093, 12 spans in the same time to 0.081.  From 1152 spans on the start is evaluated on
+    #: finer cells than it is solved on.
+    creased: Refinement
+    #: The same for systems without a fused kernel, two free-form sides or a lens among other elements.
+    system: Refinement
+    #: Wavelengths of white light in the wave image.
+    wave_colours: int
+    #: Iterations of each stage on the wave image.
+    wave_iterations: tuple[int, ...]
+    #: Time for them with `waves = "auto"`, s on two cores.
+    wave_seconds: float
+
+    # Of the initial surface
+
+    #: Least number of source cells of the transport along the lens: 250 x 250 pixels are resolved, and these cells are cheap.
+    source_cells: int = 256
+    #: The same along a lenslet, of which there are many.
+    lenslet_cells: int = 128
+    #: Cells along the lens on which the height of its vertex is chosen for a near source, of several that are tried.
+    vertex_cells: int = 64
+
+    # Of the evaluation of a design, and of a render without a number of rays
+
+    #: Rays for 250 x 250 pixels: a noise of about a thousandth.
+    final_rays: int = 4_000_000
+    #: Largest noise of the error, as a fraction of it, for which rays are added.
+    noise: float = 0.1
+    #: Most iterations for the lower bound of the error under an extended source, which then is within some per cent.
+    bound_steps: int = 1000
+    #: Whether report.png is drawn, which takes 2.5 s.
+    report: bool = True
+
+    # Of studies
+
+    #: Rays and rounds for the cost and error of each effect, a few seconds on two cores; a wave image alone takes seconds.
+    effect_rays: int = 1 << 16
+    effect_rounds: int = 5
+    wave_rounds: int = 2
+    #: Rays of the sensitivities to manufacture, and of the angles inside the lens.
+    sensitivity_rays: int = 100_000
+    #: Numbers of iterations after which architectures of networks are compared.
+    training_rounds: tuple[int, ...] = (25, 50, 100, 200)
+
+
+DRAFT = Effort(
+    seconds=0.0,
+    coarse_to_fine=(15, 25),
+    refinement=Refinement(1.0, 256, 16, 1_000_000, 2, ((1.0, 14),), large=LargePictures(256)),
+    creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
+    system=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
+    wave_colours=3,
+    wave_iterations=(10,),
+    wave_seconds=8.0,
+)
+STANDARD = Effort(
+    seconds=8.0,
+    coarse_to_fine=(25, 50),
+    refinement=Refinement(
+        *(2.0, 957, 64, 8_000_000, 4, ((0.5, 8), (1.0, 24))),
+        large=LargePictures(700, rays_per_pixel=8, most_rays=16_000_000, plan=((1.0, 24),)),
+    ),
+    creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
+    system=Refinement(2.0, 384, 48, 3_000_000, 4, ((1.0, 50),)),
+    wave_colours=5,
+    wave_iterations=(12, 20),
+    wave_seconds=25.0,
+)
+FINE = Effort(
+    seconds=60.0,
+    coarse_to_fine=(40, 120),
+    refinement=Refinement(2.0, 957, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25)), large=LargePictures(700)),
+    creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
+    system=Refinement(2.0, 384, 64, 4_000_000, 4, ((1.0, 200),)),
+    wave_colours=8,
+    wave_iterations=(30, 30),
+    wave_seconds=90.0,
+)
+TEST = replace(
+    STANDARD,
+    creased=replace(STANDARD.creased, least_spans=64),
+    source_cells=64,
+    lenslet_cells=32,
+    vertex_cells=32,
+    final_rays=40_000,
+    bound_steps=400,
+    report=False,
+    effect_rays=1000,
+    effect_rounds=1,
+    sensitivity_rays=10_000,
+    training_rounds=(3, 6),
+)
+EFFORTS = {"draft": DRAFT, "standard": STANDARD, "fine": FINE, "test": TEST}
+
+
+def current_effort() -> Effort:
+    """The effort that the environment asks for by CAUSTIC_EFFORT, "NAME [FIELD=VALUE ...]"; STANDARD unless set.
+
+    Raises:
+        InputError: there is no such effort, or a field does not exist.
+    """
+    text = os.environ.get("CAUSTIC_EFFORT", "") or "standard"
+    name, *changes = text.split()
+    try:
+        return replace(EFFORTS[name], **{field: ast.literal_eval(value) for field, value in (c.split("=") for c in changes)})
+    except (KeyError, TypeError, ValueError, SyntaxError) as error:
+        raise InputError(f"the environment's CAUSTIC_EFFORT must be one of {', '.join(EFFORTS)}, got {text!r}") from error
