@@ -123,5 +123,5 @@ def single_position(table: Table, name: str) -> tuple[float, float, float]:
     """
     places = positions(table)
     if len(places) != 1 and "angle" not in table:
-        raise InputError(f"⟨source.position⟩ of a {name} is its centre, one [x, y, z], got {len(found)}")
+        raise InputError(f"⟨source.position⟩ of a {name} is its centre, one [x, y, z], got {len(places)}")
     return places[0]
