@@ -280,7 +280,7 @@ class Settings:
         path, _, only = entry.partition(" ")
         section, _, key = path.partition(".")
         sections = self.elements if section == "element" else (getattr(self, section),)
-        none = (None, "", (), default(path) if path in TABLE else None, PLANE if path == "screen.radius" else None)
+        none = (None, "", (), default(path) if path in TABLE else False, PLANE if path == "screen.radius" else None)
         values = (getattr(one, key, None) if key else one or None for one in sections)
         return next((value for value in values if value not in none and (not only or value == only)), None)
 
