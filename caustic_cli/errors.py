@@ -1,7 +1,7 @@
 """Exceptions, with messages that are full sentences: what is wrong, where, and what would be accepted.
 
 Only the command line converts them to exit codes; every other module raises them.  Messages refer to settings by their path in
-`config.table` between marks: ⟨lens.size⟩, or ⟨mag⟩ for a parameter.  `plain`, and thus str() of an error, replaces the mark by the
+`schema.table` between marks: ⟨lens.size⟩, or ⟨mag⟩ for a parameter.  `plain`, and thus str() of an error, replaces the mark by the
 name in project.toml and in the library, [lens] size and mag; the command line by the option with which the setting was given.  A
 setting that a message recommends has a plus, ⟨+lens.size⟩, and the command line always names its option.
 """

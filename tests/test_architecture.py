@@ -8,19 +8,18 @@ from pathlib import Path
 import pytest
 
 from caustic_cli.commands import console, parser
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import MARK, InputError
+from caustic_cli.schema.table import TABLE
 
 PACKAGE = Path(__file__).resolve().parent.parent / "caustic_cli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-#: What a room may import from the package: commands -> workflow -> project -> completion -> kinds -> config -> inverse -> optics ->
-#: scene -> errors, with studies and exports beside the inverse problem.  They write files and pictures, through io, by which config
-#: reads project.toml.  The table of settings is data that stands below every room; the completion of all settings ends with that of
-#: the kind of design, and stands above both.
-BOTTOM = {"table", "errors", "loading", "effort"}
+#: What a room, a folder, may import from the package: commands -> workflow -> project -> kinds -> config -> inverse -> optics ->
+#: scene -> the schema of settings, with studies and exports beside the inverse problem.  They write files and pictures, through io,
+#: by which config reads project.toml.
+BOTTOM = {"schema", "errors", "loading", "effort"}
 ALLOWED = {
-    "table": BOTTOM,
+    "schema": BOTTOM,
     "scene": {"scene"} | BOTTOM,
     "optics": {"optics", "scene"} | BOTTOM,
     "inverse": {"inverse", "optics", "scene"} | BOTTOM,
@@ -29,12 +28,9 @@ ALLOWED = {
     "studies": {"studies", "optics", "scene", "io"} | BOTTOM,
     "config": {"config", "inverse", "io", "optics", "scene"} | BOTTOM,
     "kinds": {"kinds", "config", "inverse", "studies", "io", "optics", "scene"} | BOTTOM,
-    "completion": {"completion", "kinds", "config", "inverse", "optics", "scene"} | BOTTOM,
-    "project": {"project", "completion", "kinds", "config", "inverse", "io", "optics", "scene"} | BOTTOM,
+    "project": {"project", "kinds", "config", "inverse", "io", "optics", "scene"} | BOTTOM,
 }
 ALLOWED["workflow"] = {"workflow", "studies", "export"} | ALLOWED["project"]
-TABLE_MODULES = {"caustic_cli.config.table", "caustic_cli.config.checks"}
-COMPLETION = "caustic_cli.config.completion"
 #: Only the command line may import the command line.
 TOP = {"cli", "__main__", "commands"}
 #: What the package's top level holds, besides the rooms.
@@ -69,18 +65,13 @@ IMPORTS = {module_name(p): imports_in(ast.parse(p.read_text("utf-8")), module_na
 
 
 def part_of(module: str) -> str:
-    """`optics` for caustic_cli.optics.trace, "table" for the table of settings and its checks, "completion" for that of all
-    settings, "" for the package itself."""
-    if COMPLETION in (module, module.rpartition(".")[0]):
-        return "completion"
-    return "table" if module in TABLE_MODULES or module.rpartition(".")[0] in TABLE_MODULES else [*module.split("."), ""][1]
+    """`optics` for caustic_cli.optics.trace, "" for the package itself."""
+    return [*module.split("."), ""][1]
 
 
 def own(imported: set[str]) -> set[str]:
     """Parts of the package among the imported names that are modules, the package's own version and name aside."""
     modules = {m for m in imported if m.startswith("caustic_cli.") and (m in IMPORTS or m.rpartition(".")[0] in IMPORTS)}
-    if imported & {*TABLE_MODULES, COMPLETION}:
-        modules = {m for m in modules if m != "caustic_cli.config"}  # whose front holds nothing
     return {part_of(m) for m in modules} - {"__version__"}
 
 
@@ -113,10 +104,7 @@ def test_imports_run_one_way(part):
 
 def test_the_top_level_holds_rooms():
     assert {p.name for p in PACKAGE.glob("*.py")} == FRONT
-    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == {*ALLOWED, "commands"} - {
-        "table",
-        "completion",
-    }
+    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == {*ALLOWED, "commands"}
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.config import presets, settings
-from caustic_cli.config.table import TABLE
 from caustic_cli.config.values import refuse_bad_file, refuse_bad_options
+from caustic_cli.schema.table import TABLE
 
 #: Runs each line of its input as a command; loading torch is an error of its own.
 RUNNER = """

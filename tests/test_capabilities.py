@@ -11,7 +11,6 @@ import torch
 
 from caustic_cli.commands import manpage
 from caustic_cli.config.exclusions import EXCLUDED, EXCLUDED_LATER
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.export import FORMATS, page
 from caustic_cli.export.lighttools_script import write_script
@@ -44,6 +43,7 @@ from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
 from caustic_cli.scene.traits import TRAITS, Capability
+from caustic_cli.schema.table import TABLE
 from caustic_cli.studies.gradmap import gradient_image
 from caustic_cli.studies.manufacture import manufacture
 from caustic_cli.workflow.capabilities import capabilities

@@ -56,8 +56,7 @@ def test_the_core_alone_designs_a_lens(loaded):
 def test_the_core_loads_nothing_else(loaded):
     names = loaded[2]
     rooms = {name.partition(".")[0] for name in names} - {""}
-    assert rooms == {"config", "effort", "errors", "inverse", "loading", "optics", "scene"}
-    assert {name for name in names if name.startswith("config")} == {"config", "config.table", "config.checks"}
+    assert rooms == {"effort", "errors", "inverse", "loading", "optics", "scene", "schema"}
     assert {name.partition(".")[2] for name in names if name.startswith("inverse.")} == INVERSE
     assert not [name for name in names if name.startswith(tuple(f"optics.{room}" for room in OPTIONAL))]
     assert [name for name in names if name.startswith("optics.effects.")] == ["optics.effects.base"]

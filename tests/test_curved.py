@@ -13,7 +13,6 @@ from scipy.integrate import dblquad
 from torch.autograd import forward_ad
 
 from caustic_cli import cli
-from caustic_cli.config.completion import complete
 from caustic_cli.config.wave_stages import without_waves
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
@@ -38,6 +37,7 @@ from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer, expose, is_lowered, tracers
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
+from caustic_cli.project.completion import complete
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.screen import Sags
 from caustic_cli.studies.irradiance import irradiance, irradiance_figures

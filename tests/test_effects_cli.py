@@ -9,7 +9,6 @@ from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
@@ -22,6 +21,7 @@ from caustic_cli.optics.effects.mirror import Mirror
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.project.completion import complete
 from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.light import RGB

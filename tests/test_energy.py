@@ -11,7 +11,6 @@ from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.source_limits import point_source
 from caustic_cli.kinds import evaluation
@@ -24,6 +23,7 @@ from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.spread import Convolution, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
+from caustic_cli.project.completion import complete
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.retrace import require_energy_balance, retrace
 

@@ -290,7 +290,7 @@ EMISSIONS = {"spokes": Near.of_size}
     used="""
 import torch
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
+from caustic_cli.project.completion import complete
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
@@ -358,7 +358,7 @@ KIND = Addition(
             'KINDS = (\n    ("design.farther", "two_throws.TwoThrows"),\n',
         ),
         (
-            "config/table.py",
+            "schema/table.py",
             "    over: str = setting(",
             '    farther: float = setting("z of another screen with the same picture", "mm", 0.0, default=0.0, written=False)\n'
             "    over: str = setting(",

@@ -13,9 +13,9 @@ from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
 from caustic_cli.commands.options import power
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.io.archive import open_archive
+from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.design_report import write_report

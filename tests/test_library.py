@@ -14,10 +14,10 @@ from helpers import begun
 import caustic_cli
 from caustic_cli import cli, design, load, render, trace
 from caustic_cli.config import keywords
-from caustic_cli.config.table import TABLE, options_of
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.schema.table import TABLE, options_of
 from caustic_cli.workflow import design as workflow
 
 SMALL = {"lens": {"size": [2.0, 2.0]}, "screen": {"z": 60.0, "resolution": [32, 32]}}

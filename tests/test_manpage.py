@@ -9,8 +9,8 @@ import typer
 from caustic_cli.commands import manpage
 from caustic_cli.commands.parser import app
 from caustic_cli.config import presets
-from caustic_cli.config.table import TABLE
 from caustic_cli.scene.materials import MATERIALS
+from caustic_cli.schema.table import TABLE
 
 PAGE = Path(__file__).parents[1] / "man" / "caustic.1"
 COMMANDS = typer.main.get_command(app).commands

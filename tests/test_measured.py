@@ -15,7 +15,6 @@ from test_emission import LENS, heights, scene
 
 from caustic_cli import cli, load, render
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.optics.bounds import bounds_of
@@ -26,6 +25,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
+from caustic_cli.project.completion import complete
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet

@@ -12,7 +12,6 @@ from helpers import write_blob
 from PIL import Image
 
 from caustic_cli import cli
-from caustic_cli.config.completion import complete
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import CausticError, InputError
@@ -23,6 +22,7 @@ from caustic_cli.inverse.scene_parameters import EVALUATED, Range, Ranges
 from caustic_cli.io.files import is_ours
 from caustic_cli.kinds.network_range import NetworkOverRange
 from caustic_cli.project import checkpoint
+from caustic_cli.project.completion import complete
 from caustic_cli.studies import architectures
 from caustic_cli.studies.report import write
 from caustic_cli.workflow import architectures as grid

@@ -13,11 +13,11 @@ from PIL import Image, ImageDraw
 
 from caustic_cli import cli, design
 from caustic_cli.config import presets, settings
-from caustic_cli.config.completion import complete
-from caustic_cli.config.table import Parameters
 from caustic_cli.errors import InputError
+from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.scene.materials import MATERIALS
+from caustic_cli.schema.table import Parameters
 
 SMALL = ["--resolution", "32", "--control", "20", "--rays", "4000", "--iterations", "1", "--waves", "off", "--quiet"]
 

@@ -6,10 +6,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from caustic_cli.config import checks
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.materials import D_LINE, MATERIALS, material, refractive_index, rows
+from caustic_cli.schema import checks
 
 INF, NAN = math.inf, math.nan
 

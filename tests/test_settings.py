@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.config.default_stages import GAPS, transport_cells
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, Settings, build_lens, build_scene, dump, parse, tables_of
-from caustic_cli.config.table import Parameters
 from caustic_cli.effort import FINE, STANDARD, TEST, current_effort
 from caustic_cli.errors import InputError
+from caustic_cli.project.completion import complete
+from caustic_cli.schema.table import Parameters
 
 INDEX = 1.5443  # table D.2
 

@@ -15,7 +15,6 @@ from test_emission import LENS, heights
 
 from caustic_cli import cli
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.supported import refuse
@@ -27,6 +26,7 @@ from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import lines_of, wave_image
+from caustic_cli.project.completion import complete
 from caustic_cli.scene import Aperture, Disc, Lens, Light, PlaneWave, Points, Pupil, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet

@@ -13,7 +13,6 @@ from test_export import make
 
 import caustic_cli
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba
@@ -23,6 +22,7 @@ from caustic_cli.optics.emission.near import Near
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
+from caustic_cli.project.completion import complete
 from caustic_cli.scene import (
     Aperture,
     CircularAperture,

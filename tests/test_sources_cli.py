@@ -10,9 +10,9 @@ from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.config.design import build_stages
 from caustic_cli.errors import InputError
+from caustic_cli.project.completion import complete
 from caustic_cli.scene import Disc, Offset, Points
 from caustic_cli.workflow import design as workflow
 

@@ -9,17 +9,17 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli.config.completion import complete
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import build_scene
-from caustic_cli.config.table import Parameters
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import is_ours
 from caustic_cli.kinds import OneSurface
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.intersection import find
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.project.completion import complete
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.schema.table import Parameters
 from caustic_cli.studies import intersection, optimiser_comparison
 from caustic_cli.studies.report import as_json, paths_of, refuse_foreign_files, write
 from caustic_cli.studies.retrace import retrace

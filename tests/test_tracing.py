@@ -12,7 +12,6 @@ import torch.autograd.forward_ad as fwd
 from helpers import pairwise
 from scipy.interpolate import BSpline
 
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.rays import LOSSES, RayState, RayStatus
 from caustic_cli.optics.reconstruction import Filter
@@ -21,6 +20,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.schema.table import TABLE
 
 FRESNEL = TABLE["lens.fresnel"].choices
 

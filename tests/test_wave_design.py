@@ -16,7 +16,6 @@ from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
-from caustic_cli.config import completion
 from caustic_cli.config.default_stages import LEAST_WAVES, wave_refinement
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import build_scene
@@ -30,6 +29,7 @@ from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_ma
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
+from caustic_cli.project import completion
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import diffraction
 from caustic_cli.studies.metrics import relative_rms

@@ -27,8 +27,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import LISTS, MARK, InputError, plain_name, shortened
+from caustic_cli.schema.table import TABLE
 
 #: Seconds between lines of --progress json.
 LINE_EVERY = 0.5

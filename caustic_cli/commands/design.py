@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from caustic_cli.commands import console, options
-from caustic_cli.config import checks
-from caustic_cli.config.table import TABLE, default
 from caustic_cli.errors import InputError
+from caustic_cli.schema import checks
+from caustic_cli.schema.table import TABLE, default
 
 EXAMPLES = """Examples:
 

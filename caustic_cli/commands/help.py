@@ -7,7 +7,7 @@ import sys
 from types import MethodType
 from typing import Any
 
-from caustic_cli.config import table
+from caustic_cli.schema import table
 
 #: The most common options, in this order, at the beginning of a command's help.
 BASICS = {

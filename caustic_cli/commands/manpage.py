@@ -15,10 +15,10 @@ from caustic_cli import __version__
 from caustic_cli.commands.options import default_words
 from caustic_cli.commands.parser import parser
 from caustic_cli.config import presets
-from caustic_cli.config.table import TABLE, Setting
 from caustic_cli.errors import plain_name
 from caustic_cli.io.files import read_bytes, write_bytes
 from caustic_cli.scene import materials
+from caustic_cli.schema.table import TABLE, Setting
 from caustic_cli.workflow.capabilities import matrix
 
 HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"

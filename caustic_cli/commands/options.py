@@ -19,9 +19,9 @@ import typer
 
 from caustic_cli.commands import console
 from caustic_cli.commands.console import ConsoleReporter
-from caustic_cli.config import checks, table
-from caustic_cli.config.table import Setting
 from caustic_cli.errors import InputError, near, no_project
+from caustic_cli.schema import checks, table
+from caustic_cli.schema.table import Setting
 
 #: Options whose value `list` prints all that are known: key in JSON, heading of the table, and the module that has them.
 LISTS = {

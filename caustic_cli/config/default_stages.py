@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import default
 from caustic_cli.effort import STANDARD, Effort, Refinement
 from caustic_cli.inverse.initial_surface import COARSE
 from caustic_cli.scene import Source
+from caustic_cli.schema.table import default
 
 Table = dict[str, Any]
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2

@@ -9,7 +9,6 @@ import torch
 
 from caustic_cli.config.default_stages import stage_base
 from caustic_cli.config.settings import Settings, build_screen, build_source
-from caustic_cli.config.table import StageSettings, check_all
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.parametrisation import Architecture, Parametrisation
@@ -17,6 +16,7 @@ from caustic_cli.inverse.problem import Options
 from caustic_cli.inverse.schedule import LossImage, Stage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
+from caustic_cli.schema.table import StageSettings, check_all
 
 
 def relative_to_initial(design: Mapping[str, Any]) -> bool:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import TABLE, default
 from caustic_cli.errors import InputError
 from caustic_cli.optics.waves.unsupported import WAVE_REFINEMENT, WAVES_BY_DEFAULT
 from caustic_cli.scene.elements import NOT_BESIDE
 from caustic_cli.scene.traits import TRAITS, Capability
+from caustic_cli.schema.table import TABLE, default
 
 
 def _by_settings(capability: Capability) -> dict[str, str]:

@@ -15,8 +15,8 @@ import numpy as np
 
 from caustic_cli.config import settings
 from caustic_cli.config.settings import TABLES, Given
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError, alternatives
+from caustic_cli.schema.table import TABLE
 
 #: Keywords of lists of tables, and their paths.
 LISTED = {"element": "element", "stages": "design.stages"}

@@ -8,7 +8,10 @@ from __future__ import annotations
 import math
 
 from caustic_cli.config.settings import Settings, build_source
-from caustic_cli.config.table import (
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.scene_parameters import Ranges
+from caustic_cli.scene.traits import TRAITS
+from caustic_cli.schema.table import (
     DesignSettings,
     ElementSettings,
     SecondSettings,
@@ -16,9 +19,6 @@ from caustic_cli.config.table import (
     check,
     default,
 )
-from caustic_cli.errors import InputError
-from caustic_cli.inverse.scene_parameters import Ranges
-from caustic_cli.scene.traits import TRAITS
 
 OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
 BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture

@@ -1,7 +1,7 @@
 """Reading and writing of project.toml, and construction of the scene from it.
 
 What a user gives is a nested dict with the keys of the file (`Given`); completed, it is a `Settings` of typed sections.  Names,
-types and defaults are defined in `config.table`.  Keys and types are checked here, ranges when the scene and the stages are
+types and defaults are defined in `schema.table`.  Keys and types are checked here, ranges when the scene and the stages are
 constructed.
 """
 
@@ -19,7 +19,14 @@ import numpy as np
 import tomli_w
 
 from caustic_cli import __version__
-from caustic_cli.config.table import (
+from caustic_cli.errors import InputError, alternatives, near
+from caustic_cli.io.files import read_bytes
+from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
+from caustic_cli.scene.gradient import KINDS, Gradient
+from caustic_cli.scene.materials import refractive_index
+from caustic_cli.scene.screen import PLANE, Sags
+from caustic_cli.scene.sources.section import content
+from caustic_cli.schema.table import (
     TABLE,
     DesignSettings,
     ElementSettings,
@@ -35,13 +42,6 @@ from caustic_cli.config.table import (
     default,
     in_section,
 )
-from caustic_cli.errors import InputError, alternatives, near
-from caustic_cli.io.files import read_bytes
-from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
-from caustic_cli.scene.gradient import KINDS, Gradient
-from caustic_cli.scene.materials import refractive_index
-from caustic_cli.scene.screen import PLANE, Sags
-from caustic_cli.scene.sources.section import content
 
 #: Settings as given, by section and key.
 Given = dict[str, dict[str, Any]]
@@ -235,7 +235,7 @@ def _numeric(where: str, value, whole: bool):
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a project by section, complete unless `config.completion` is at work on them."""
+    """The settings of a project by section, complete unless `project.completion` is at work on them."""
 
     source: SourceSettings
     lens: LensSettings
@@ -268,7 +268,7 @@ class Settings:
         return replace(self, **sections)
 
     def value(self, path: str) -> Any:
-        """The value of a setting, or its default, by its path in `config.table`; None in a section that is not there."""
+        """The value of a setting, or its default, by its path in `schema.table`; None in a section that is not there."""
         section, _, key = path.partition(".")
         return getattr(getattr(self, section), key, None)
 
@@ -280,7 +280,7 @@ class Settings:
         path, _, only = entry.partition(" ")
         section, _, key = path.partition(".")
         sections = self.elements if section == "element" else (getattr(self, section),)
-        none = (None, "", (), default(path) if path in TABLE else None, PLANE if path == "screen.radius" else None)
+        none = (None, "", (), default(path) if path in TABLE else False, PLANE if path == "screen.radius" else None)
         values = (getattr(one, key, None) if key else one or None for one in sections)
         return next((value for value in values if value not in none and (not only or value == only)), None)
 
@@ -493,7 +493,7 @@ def refuse_unused(source: Mapping[str, Any], given: Iterable[str], stages: Seque
 
 
 def by_section(given: Mapping[str, Any]) -> Given:
-    """Given from values by their paths in `config.table`; parameters without a section become the section ""."""
+    """Given from values by their paths in `schema.table`; parameters without a section become the section ""."""
     found: Given = {}
     for path, value in given.items():
         section, _, key = path.rpartition(".")

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from caustic_cli.config import settings, tolerances
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.loss_terms import parse
 from caustic_cli.scene import materials, sources
+from caustic_cli.schema.table import TABLE
 
 #: Words of design.start that are no file.
 STARTS = ("transport", "offset")

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config import checks
 from caustic_cli.errors import InputError
 from caustic_cli.export.reading import Reading, spline_through
 from caustic_cli.export.surface import (
@@ -38,6 +37,7 @@ from caustic_cli.optics.surfaces.facets import DiscFacets, FacetSurface, vertex_
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import freeform_of
 from caustic_cli.scene import Aperture, CircularAperture, FreeForm
+from caustic_cli.schema import checks
 
 STRETCH = 1.28
 #: Least number of points across a disc within a tolerance; points evaluated at a time along one axis, which bounds the memory.

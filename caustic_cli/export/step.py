@@ -27,7 +27,6 @@ from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.config import checks
 from caustic_cli.export.approximation import on_fewer_knots
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
@@ -39,6 +38,7 @@ from caustic_cli.optics.frames import Pose, rotate_to_global, to_global
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of, freeform_of
 from caustic_cli.scene import Aperture, CircularAperture, Lens, Scene
+from caustic_cli.schema import checks
 
 HEAD = f"""ISO-10303-21;
 HEADER;

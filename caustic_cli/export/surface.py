@@ -27,10 +27,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config import checks
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.schema import checks
 
 #: Equal steps per knot span of a grid unless another is given.  A not-a-knot bicubic is exact with 1 except beside the border,
 #: and with 2 everywhere; with 4 a natural spline, whose end conditions are wrong, has an error of some micrometres on the screen.

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from caustic_cli.config.table import check_all
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.optics import curvature
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.schema.table import check_all
 
 #: Points per knot span at which the limits are enforced and at which they are finally checked, and most along an axis.
 A_SPAN, CHECKED, MOST = 4, 10, 4001

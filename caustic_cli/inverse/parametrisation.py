@@ -30,9 +30,9 @@ from scipy.fft import dctn, idctn
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from caustic_cli.config import checks
-from caustic_cli.config.table import check, check_all, default
 from caustic_cli.errors import InputError
+from caustic_cli.schema import checks
+from caustic_cli.schema.table import check, check_all, default
 
 NETWORKS = ("none", "sparse", "dense")
 #: zero-last: random but for a zero last layer of the network, which then starts at the initial surface.

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from caustic_cli.config.table import check_all
 from caustic_cli.effort import STANDARD, Effort
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.constraints import Limits
@@ -27,6 +26,7 @@ from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
+from caustic_cli.schema.table import check_all
 
 
 class Skipped(CausticError):

@@ -16,8 +16,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from caustic_cli.config import checks
 from caustic_cli.errors import CausticError, InputError, Interrupted
+from caustic_cli.schema import checks
 
 
 @contextmanager

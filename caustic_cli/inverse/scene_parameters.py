@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.optics.sampling import stream
 from caustic_cli.scene import Scene, Source
+from caustic_cli.schema.table import check
 
 #: Parameters that may vary, and the setting whose bounds apply.
 KEYS = {"throw": "screen.z", "source.x": "source.position", "source.y": "source.position", "source.z": "source.position"}

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from caustic_cli.config import checks
-from caustic_cli.config.table import check_all, default
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.scene import Source
+from caustic_cli.schema import checks
+from caustic_cli.schema.table import check_all, default
 
 #: Rays whose cost equals that of the Fourier transform at one wavelength of a typical scene.
 RAYS_A_WAVE = 600_000

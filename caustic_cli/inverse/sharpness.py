@@ -20,7 +20,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import alternatives
 from caustic_cli.inverse.deconvolution import deconvolved
 from caustic_cli.inverse.reachability import largest_magnification
@@ -29,6 +28,7 @@ from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread
 from caustic_cli.scene import Disc, PlaneWave, Scene
 from caustic_cli.scene.sources.section import SUN
+from caustic_cli.schema.table import TABLE
 
 #: RMS error of a picture that counts as sharp, in parts of its contrast: 20 dB below it.
 SHARP = 0.1

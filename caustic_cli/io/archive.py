@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import Archive, open_npz
 from caustic_cli.io.files import naming
@@ -29,6 +28,7 @@ from caustic_cli.scene.sources.points import MAX_POINTS
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import MOST, Several
+from caustic_cli.schema.table import check
 
 #: Keys of a source and of its spectrum.
 KEYS = (

@@ -13,13 +13,13 @@ from PIL import Image
 from scipy.interpolate import make_lsq_spline
 from torch import Tensor
 
-from caustic_cli.config.checks import LENGTH
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import naming, open_regular, read_bytes
 from caustic_cli.io.picture import undecoded
 from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.schema.checks import LENGTH
+from caustic_cli.schema.table import TABLE
 
 #: Suffixes of the pictures; largest value of a PNG; format version of the JSON.
 SUFFIXES = (".png", ".tif", ".tiff")

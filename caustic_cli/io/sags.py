@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from caustic_cli.config.checks import LENGTH
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import open_npy
 from caustic_cli.io.files import naming, read_bytes
 from caustic_cli.io.picture import undecoded
 from caustic_cli.scene.screen import MAX_SAGS
+from caustic_cli.schema.checks import LENGTH
 
 #: Bytes of a file: MAX_SAGS by MAX_SAGS heights of 8 bytes, and its header.
 MOST_BYTES = (1 << 27) + (1 << 16)

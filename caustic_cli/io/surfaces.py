@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config.checks import LENGTH
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.io import heightmaps
 from caustic_cli.io.arrays import Archive, open_npy, open_npz
 from caustic_cli.io.files import naming, read_bytes
 from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.schema.checks import LENGTH
+from caustic_cli.schema.table import TABLE
 
 #: Most control points along one axis of a surface.
 MAX_CONTROL = int(TABLE["lens.control"].high)

@@ -10,11 +10,11 @@ from typing import Any
 from caustic_cli.config.default_stages import RAYS_PER_PIXEL, Table, completed_stage, usual_sampler
 from caustic_cli.config.design import relative_to_initial
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen
-from caustic_cli.config.table import DesignSettings, LensSettings, StageSettings, check
 from caustic_cli.effort import DRAFT, EFFORTS, FINE, STANDARD, Effort, current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.scene import Scene, Source
+from caustic_cli.schema.table import DesignSettings, LensSettings, StageSettings, check
 
 EXTENDED = 5.0  # factor of the time limits of qualities for an extended source, whose start includes a deconvolution
 LEAST_SPANS = STANDARD.refinement.least_spans  # which resolve an initial surface
@@ -26,7 +26,7 @@ class Defaults:
     Args:
         s: all settings, replaced as they are completed; source: built from them.
         quality: of the default stages, None for that of the time limit; rays: of the last of them, None for that of the quality.
-        lit, gaps: of the picture, see `config.completion.complete`.
+        lit, gaps: of the picture, see `project.completion.complete`.
     """
 
     def __init__(self, s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float], gaps: float):

@@ -16,12 +16,12 @@ import torch
 
 from caustic_cli.config.default_stages import refinement, transport_cells
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import LensSettings, ScreenSettings, check, check_all
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.gradient_index import design_gradient_index
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.surface import OneSurface
+from caustic_cli.schema.table import LensSettings, ScreenSettings, check, check_all
 
 #: Half range about the index; degree of its splines, knot spans per pixel and their largest number.
 HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS = 0.05, 3, 2, 768

@@ -23,7 +23,6 @@ from caustic_cli.config.default_stages import (
 )
 from caustic_cli.config.design import build_options, build_stages, relative_to_initial
 from caustic_cli.config.settings import Settings, build_screen
-from caustic_cli.config.table import LensSettings, ScreenSettings, check, default
 from caustic_cli.config.wave_stages import wave_stages
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
@@ -54,6 +53,7 @@ from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
+from caustic_cli.schema.table import LensSettings, ScreenSettings, check, default
 from caustic_cli.studies.retrace import retrace
 
 waves, manufacture = OnDemand("caustic_cli.inverse.wave_objective"), OnDemand("caustic_cli.studies.manufacture")

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from caustic_cli.config.default_stages import refinement
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import LensSettings, ScreenSettings, check
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import InitialSurface
@@ -28,6 +27,7 @@ from caustic_cli.kinds.surface import Described
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.system import split_heights
 from caustic_cli.scene import Scene
+from caustic_cli.schema.table import LensSettings, ScreenSettings, check
 from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures

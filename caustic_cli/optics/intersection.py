@@ -25,10 +25,10 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from caustic_cli.config import checks
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.surfaces.base import SECOND, Surface, SurfaceIntersection
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
+from caustic_cli.schema import checks
 
 METHODS = ("newton", "mesh", "mesh+newton")
 

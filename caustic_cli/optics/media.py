@@ -11,11 +11,11 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from caustic_cli.config import checks
 from caustic_cli.optics.ray_transfer import meet
 from caustic_cli.optics.rays import RayState
 from caustic_cli.scene import Lens
 from caustic_cli.scene.materials import refractive_index
+from caustic_cli.schema import checks
 
 
 @dataclass(frozen=True)

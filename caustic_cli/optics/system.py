@@ -17,8 +17,6 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from caustic_cli.config import checks
-from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import AxisSegment, Pose
@@ -27,6 +25,8 @@ from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Sphere, Surfa
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Aperture, Component, FreeForm, Lens, Light, Pupil, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES, surface_name
+from caustic_cli.schema import checks
+from caustic_cli.schema.table import TABLE
 
 INTERACTIONS = ("refract", "reflect")
 #: Names of the elements of a one-lens scene.

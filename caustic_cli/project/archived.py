@@ -42,7 +42,7 @@ class ArchivedLens:
         return Path(f"{self.path.stem}-render.png")
 
     def read(self, given: Mapping[str, Any]) -> LensData:
-        """The lens; given: path in `config.table` -> value, which may be the `source.file` of its rays only, if its source is a
+        """The lens; given: path in `schema.table` -> value, which may be the `source.file` of its rays only, if its source is a
         ray file."""
         other, rays = dict(given), None
         if "source.file" in other and other.get("source.type", "rays") == "rays":

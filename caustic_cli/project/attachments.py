@@ -15,7 +15,6 @@ import numpy as np
 
 from caustic_cli.config import settings, tolerances
 from caustic_cli.config.settings import Given, Settings
-from caustic_cli.config.table import TABLE, Section, Setting
 from caustic_cli.io.arrays import open_npy
 from caustic_cli.io.files import read_bytes
 from caustic_cli.io.picture import read_picture
@@ -23,6 +22,7 @@ from caustic_cli.loading import OnDemand
 from caustic_cli.scene.gradient import MOST_VALUES, checked_volume
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.section import Attached
+from caustic_cli.schema.table import TABLE, Section, Setting
 
 intensities, sags = OnDemand("caustic_cli.io.intensities"), OnDemand("caustic_cli.io.sags")
 rayfiles = OnDemand("caustic_cli.io.rayfiles")

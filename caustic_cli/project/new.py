@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from caustic_cli.config import presets, settings
-from caustic_cli.config.completion import complete
 from caustic_cli.config.settings import Given, Settings
-from caustic_cli.config.table import Parameters, TargetSettings
 from caustic_cli.config.wave_stages import without_waves
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
@@ -17,7 +15,9 @@ from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.optics.obstruction import clear_shift
 from caustic_cli.project import attachments, uptodate
+from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
+from caustic_cli.schema.table import Parameters, TargetSettings
 
 
 def new_project(
@@ -31,7 +31,7 @@ def new_project(
     """A project, of which nothing is written yet, and the settings that were given, by section.
 
     Args:
-        given: path in `config.table` -> value, including derived parameters such as "mag".
+        given: path in `schema.table` -> value, including derived parameters such as "mag".
         preset: a name of `config.presets`, whose settings are overridden by those of config.
         config: a TOML file of further settings, which are overridden by those `given`.
         out: its directory; None for a project in memory.

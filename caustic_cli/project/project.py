@@ -16,10 +16,8 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete, complete_source
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import SourceSettings, TargetSettings
 from caustic_cli.errors import InputError, no_project, plain
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.scene_parameters import Ranges
@@ -33,8 +31,10 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, checkpoint
 from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.completion import complete, complete_source
 from caustic_cli.scene import Scene, sources
 from caustic_cli.scene.sources.section import content
+from caustic_cli.schema.table import SourceSettings, TargetSettings
 
 TOML, CHECKPOINT, RENDER, WAVE, REPORT = "project.toml", "checkpoints.h5", "render.png", "wave.png", "report.png"
 #: Name of the image on the second screen, of a design with one.
@@ -249,7 +249,7 @@ class Project:
         return self.path / RENDER
 
     def read(self, given: Mapping[str, Any]) -> LensData:
-        """The lens of the last checkpoint, at the parameter values; given: path in `config.table` -> value, overriding settings."""
+        """The lens of the last checkpoint, at the parameter values; given: path in `schema.table` -> value, overriding settings."""
         scene = self.scene(given)
         target = self.target(scene)
         scene, field, heights, checkpoint = self.lens(scene)

@@ -19,7 +19,6 @@ from torch import Tensor
 from caustic_cli import __version__
 from caustic_cli.config import settings
 from caustic_cli.config.settings import Settings
-from caustic_cli.config.table import options_of
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import read_bytes, refuse_foreign, sha256_of, write_bytes
 from caustic_cli.io.heightmaps import beside
@@ -27,6 +26,7 @@ from caustic_cli.io.picture import Picture
 from caustic_cli.project import attachments
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, FARTHER, MADE, RENDER, WAVE, Project, is_project
+from caustic_cli.schema.table import options_of
 
 RECORD = ".outputs.json"
 #: Entry of the design itself.

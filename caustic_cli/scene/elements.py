@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
-from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError, at_least
 from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of
 from caustic_cli.scene.freeform import FreeForm
@@ -25,6 +24,7 @@ from caustic_cli.scene.interaction import Reflecting, Refracting
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import Screen, Window, tilted
 from caustic_cli.scene.traits import Capability
+from caustic_cli.schema.table import check, default
 
 #: Largest semi-aperture of a sphere, as a fraction of its radius: beyond it light arrives near grazing incidence.
 STEEPEST = 0.95

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.scene.screen import Screen
+from caustic_cli.schema.table import check
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,13 +15,13 @@ from functools import cached_property
 
 import numpy as np
 
-from caustic_cli.config import checks
-from caustic_cli.config.table import TABLE, check, check_all, default
 from caustic_cli.errors import InputError
 from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of
 from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.interaction import Interior, Reflecting, Refracting
+from caustic_cli.schema import checks
+from caustic_cli.schema.table import TABLE, check, check_all, default
 
 
 @dataclass(frozen=True)

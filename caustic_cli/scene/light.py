@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
+from caustic_cli.schema.table import check
 
 #: Dominant wavelengths of the sRGB primaries (IEC 61966-2-1), nm, which represent red, green and blue.
 RGB = (611.4, 549.1, 464.3)

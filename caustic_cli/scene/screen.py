@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from caustic_cli.config.table import check_all, default
 from caustic_cli.errors import InputError, at_least
 from caustic_cli.scene.aperture import Aperture
+from caustic_cli.schema.table import check_all, default
 
 #: Largest number of points of a measured shape along an axis.
 MAX_SAGS = 4096

@@ -16,8 +16,8 @@ from statistics import NormalDist
 
 import numpy as np
 
-from caustic_cli.config import checks
 from caustic_cli.errors import InputError
+from caustic_cli.schema import checks
 
 NORMAL, UNIFORM = "sigma", "half_width"
 #: Least and largest number of Monte Carlo samples.

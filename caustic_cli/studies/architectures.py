@@ -15,9 +15,9 @@ import torch
 from matplotlib.figure import Figure
 
 from caustic_cli import __version__
-from caustic_cli.config import checks
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import CausticError
+from caustic_cli.schema import checks
 from caustic_cli.studies.report import Study, plain_ticks, styles
 
 #: Seconds for each candidate, unless said.

@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.config import checks
 from caustic_cli.optics.backends import plain
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
+from caustic_cli.schema import checks
 from caustic_cli.studies.fit import Order, knee, order
 from caustic_cli.studies.measurement import REFERENCE_SEED, Benchmark, Reference, Setting, busy_warning
 from caustic_cli.studies.metrics import relative_rms

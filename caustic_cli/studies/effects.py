@@ -21,7 +21,6 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.config import checks
 from caustic_cli.effort import STANDARD, Effort, current_effort
 from caustic_cli.optics.effects import EFFECTS, Decision, Requests
 from caustic_cli.optics.emission import rays_of
@@ -33,6 +32,7 @@ from caustic_cli.optics.trace import expose, is_lowered
 from caustic_cli.optics.waves.image import UNASKED, wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
+from caustic_cli.schema import checks
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, Study
 

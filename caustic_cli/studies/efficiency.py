@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.config import checks
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import CausticError
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
+from caustic_cli.schema import checks
 from caustic_cli.studies.fit import pareto
 from caustic_cli.studies.report import Study, legend_beside, styles
 from caustic_cli.studies.retrace import retrace

@@ -31,7 +31,6 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.config import checks
 from caustic_cli.errors import CausticError
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.bspline import SplineSpace
@@ -42,6 +41,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Points, Scene
+from caustic_cli.schema import checks
 from caustic_cli.studies.fit import Order, order
 from caustic_cli.studies.measurement import busy_warning
 from caustic_cli.studies.report import Study, draw_front, legend_beside, plain_ticks, spread, styles

@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.config import checks
 from caustic_cli.effort import current_effort
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
+from caustic_cli.schema import checks
 from caustic_cli.studies.report import Study, draw_front, legend_beside, plain_ticks
 from caustic_cli.studies.retrace import retrace
 

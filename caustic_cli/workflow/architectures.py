@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, InitialHeights
 from caustic_cli.inverse.parametrisation import Architecture, Parametrisation
 from caustic_cli.inverse.problem import Options
 from caustic_cli.io.picture import Picture
 from caustic_cli.kinds import OneSurface, problem_of
+from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.scene.traits import Capability
 from caustic_cli.workflow.comparison import picture_of_disc

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.config.default_stages import coarse_to_fine
 from caustic_cli.config.design import stage_of
 from caustic_cli.config.settings import Settings
@@ -28,6 +27,7 @@ from caustic_cli.io.picture import Picture
 from caustic_cli.kinds import problem_of
 from caustic_cli.kinds.surface import NETWORK_CONTROL
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Scene
 

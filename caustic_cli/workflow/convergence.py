@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from caustic_cli.config import checks
+from caustic_cli.schema import checks
 
 if TYPE_CHECKING:
     import torch

@@ -21,9 +21,7 @@ import torch
 
 from caustic_cli import __version__
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete, shape_words
 from caustic_cli.config.settings import Given
-from caustic_cli.config.table import TABLE, LensSettings
 from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.designer import Designer, InitialHeights, State
@@ -40,10 +38,12 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.completion import complete, shape_words
 from caustic_cli.project.new import new_project
 from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, Project, is_project
 from caustic_cli.scene import Scene
+from caustic_cli.schema.table import TABLE, LensSettings
 from caustic_cli.workflow.compilation import announce_compilation, compile_usual
 from caustic_cli.workflow.evaluation import evaluate_and_write, evaluation_seconds, expected_seconds
 from caustic_cli.workflow.movie import NoMovie
@@ -94,7 +94,7 @@ def prepare(
     If the same design exists already, finished or not, its project is opened instead (`Project.checkpoint`).
 
     Args:
-        given: path in `config.table` -> value, including derived parameters such as "mag".
+        given: path in `schema.table` -> value, including derived parameters such as "mag".
         preset: a name of `config.presets`, whose settings are overridden by those of config.
         config: a TOML file of further settings, which are overridden by those `given`.
         out: the directory; None for a design in memory.

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config import checks, keywords
+from caustic_cli.config import keywords
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.export import format_of
@@ -28,6 +28,7 @@ from caustic_cli.project.archived import ArchivedLens, origin_of
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
+from caustic_cli.schema import checks
 from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import evaluation_rays, retrace
 from caustic_cli.studies.waves import height_deviation, wave_figures
@@ -88,7 +89,7 @@ class Lens:
 
     @classmethod
     def of(cls, origin: Project | ArchivedLens, given: Mapping[str, Any] | None = None) -> Lens:
-        """The lens of a project or an archive; given: path in `config.table` -> value, overriding the settings of a project."""
+        """The lens of a project or an archive; given: path in `schema.table` -> value, overriding the settings of a project."""
         data = origin.read(given or {})
         return cls(*data[:4], dict(data.figures), origin, *data[5:])
 
@@ -98,7 +99,7 @@ class Lens:
         return self.origin if isinstance(self.origin, Project) else None
 
     def under(self, given: Mapping[str, Any]) -> Lens:
-        """The lens in its scene with other settings of light or screen: path in `config.table` -> value.
+        """The lens in its scene with other settings of light or screen: path in `schema.table` -> value.
 
         Raises:
             InputError: it comes from an archive, whose scene is fixed, or a value is out of range.

@@ -131,7 +131,7 @@ def design_of(
     say: Reporter,
     device: str = "cpu",
 ) -> Lens:
-    """Design a lens for a picture and settings by their paths in `config.table`: {"mag": 3, "lens.size": [20, 20]}.
+    """Design a lens for a picture and settings by their paths in `schema.table`: {"mag": 3, "lens.size": [20, 20]}.
 
     Args:
         preset: settings by name, see `config.presets`; config: a TOML file of further ones, which override those of the preset and

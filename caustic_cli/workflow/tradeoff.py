@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import complete
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.io.picture import Picture
 from caustic_cli.kinds import problem_of
+from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.studies.efficiency import DesignedLens
 from caustic_cli.workflow.comparison import picture_of_disc

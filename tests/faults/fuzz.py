@@ -38,7 +38,6 @@ from PIL import Image
 from rayfiles import cone_of, lighttools, tm25, zemax
 from test_export import make
 
-from caustic_cli.config.completion import complete
 from caustic_cli.config.settings import dump
 from caustic_cli.errors import CausticError
 from caustic_cli.export.lighttools import write_lighttools
@@ -49,6 +48,7 @@ from caustic_cli.io.picture import read_picture
 from caustic_cli.io.surfaces import read_surface
 from caustic_cli.project import attachments, checkpoint
 from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 
 #: Bounds of a case: seconds of wall clock, and bytes of memory.

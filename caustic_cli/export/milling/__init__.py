@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields
 
-from caustic_cli.config import checks
 from caustic_cli.errors import InputError
+from caustic_cli.schema import checks
 
 PATHS = ("raster", "raster-y", "spiral")
 TOOLS = ("ball", "flat")

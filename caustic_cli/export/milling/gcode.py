@@ -24,8 +24,6 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.config import checks
-from caustic_cli.config.checks import LENGTH
 from caustic_cli.errors import InputError
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.milling.offset import BallOffset, FlatOffset, shape_of
@@ -35,6 +33,8 @@ from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Aperture
+from caustic_cli.schema import checks
+from caustic_cli.schema.checks import LENGTH
 
 #: Tolerance of the path over the scallop height; digits of a coordinate beyond those of the tolerance; least number of digits.
 PATH_PART, MORE_DIGITS, LEAST_DIGITS = 0.01, 1, 4

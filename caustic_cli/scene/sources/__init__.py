@@ -12,12 +12,12 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from caustic_cli.config import checks
 from caustic_cli.errors import InputError
 from caustic_cli.loading import OnDemand
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.plane import PlaneWave
 from caustic_cli.scene.sources.section import COMMON, SUN, SourceType, Table
+from caustic_cli.schema import checks
 
 if TYPE_CHECKING:
     from caustic_cli.scene.sources.disc import Disc

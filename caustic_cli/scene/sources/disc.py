@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 
-from caustic_cli.config.table import check, check_all
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
@@ -24,6 +23,7 @@ from caustic_cli.scene.sources.section import (
     position_defaults,
     single_position,
 )
+from caustic_cli.schema.table import check, check_all
 
 #: Intervals of each step that locates the farthest point of an ellipse, and steps: the angle to 1e-6, the distance to 1e-12.
 ZOOM, ZOOMS = 64, 4

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.section import SourceType, Table
+from caustic_cli.schema.table import check
 
 
 @dataclass(frozen=True, eq=False)

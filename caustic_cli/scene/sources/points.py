@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
@@ -21,6 +20,7 @@ from caustic_cli.scene.sources.section import (
     positions,
     single_position,
 )
+from caustic_cli.schema.table import check
 
 #: Largest number of point sources.
 MAX_POINTS = 1_000_000

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from caustic_cli.config.table import check_all
 from caustic_cli.errors import InputError
 from caustic_cli.scene.aperture import Pupil
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.section import DISTANCE, SourceType, Table, content, positions
+from caustic_cli.schema.table import check_all
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.schema.table import check
 
 #: Angular diameter of the sun, degrees.
 SUN = 0.533

@@ -45,7 +45,7 @@ class Tracing:
     reconstruction: str = "bincount"
     filter_size: Sequence[int] = (3, 3)
     alpha: float | None = None
-    #: Path in `config.table` -> value, overriding the settings of the project.
+    #: Path in `schema.table` -> value, overriding the settings of the project.
     given: Mapping[str, Any] = field(default_factory=dict)
     #: The screen's z instead of the scene's, mm.
     screen_at: float | None = None

@@ -16,8 +16,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-from caustic_cli.config import checks
 from caustic_cli.errors import InputError
+from caustic_cli.schema import checks
 
 #: Bounds of lengths on the lens, of distances and of sizes on the screen, mm.
 LENS, DISTANCE, SCREEN = (1e-6, 1e6), (-1e12, 1e12), (1e-6, 1e9)

@@ -23,13 +23,13 @@ from caustic_cli.config.optional import (
     middle_source,
 )
 from caustic_cli.config.settings import Given, Settings, build_screen, build_source, index_of
-from caustic_cli.config.table import LensSettings, Parameters, ScreenSettings, SourceSettings, TargetSettings, check
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.kinds import complete_design, kind_of
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.scene import Offset, Source, sources
 from caustic_cli.scene.light import RGB
+from caustic_cli.schema.table import LensSettings, Parameters, ScreenSettings, SourceSettings, TargetSettings, check
 
 DEFAULT_RESOLUTION = 250
 STEEPEST = 1.25  # least radius of a derived sphere in half diagonals of the lens: slopes up to 1.3
