@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from caustic_cli.inverse.waves import WaveObjective
 from helpers import begun
 from PIL import Image
 from rayfiles import cone_of, tm25
@@ -24,7 +25,6 @@ from caustic_cli.inverse.initial_surface import first_surface, sphere_net
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.schedule import LossImage
-from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import AxisSegment

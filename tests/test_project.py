@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from caustic_cli import cli
-from caustic_cli.commands.console import Reporter
+from caustic_cli.commands.console import ConsoleReporter
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
 from caustic_cli.optics.bspline import SplineSpace
@@ -44,9 +44,9 @@ def designed(tmp_path_factory):
     np.save(folder / "blob.npy", np.exp(-((x[:, None] - 6) ** 2 + (x - 12) ** 2) / 20.0) + 0.1)
     (folder / "c.toml").write_text(CONFIG)
     begun = workflow.prepare(
-        folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=Reporter(quiet=True)
+        folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=ConsoleReporter(quiet=True)
     )
-    workflow.design(begun, "cpu", Reporter(quiet=True), 0.0)
+    workflow.design(begun, "cpu", ConsoleReporter(quiet=True), 0.0)
     return begun.project.path
 
 
