@@ -112,7 +112,7 @@ class Project:
         given = settings.read(path / TOML)
         try:
             goal = TargetSettings.of(given.get("target", {}))
-            name = goal.file or "target.png"
+            name = goal.get("file", "target.png")
             for file in (name, *(table[row.key] for table, row in attachments.names_in(given))):
                 _within(file)
             picture = read_picture(path / name, goal.encoding == "linear", goal.color)

@@ -36,6 +36,7 @@ def designed(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _here(designed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True")  # without its report a design is not complete
     shutil.copytree(designed, "blob.caustic")
 
 
