@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from caustic_cli.inverse.waves import WaveObjective
 from helpers import begun
 from PIL import Image
 from rayfiles import cone_of, tm25
