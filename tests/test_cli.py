@@ -360,6 +360,8 @@ def test_the_table_fits_a_terminal_and_any_encoding(monkeypatch, capfd, encoding
 def test_render_traces_the_rays_of_the_verdict_and_keeps_the_better_picture(here, capfd, monkeypatch):
     monkeypatch.setenv("CAUSTIC_EFFORT", "test final_rays=200000")
     picture = Path("blob.caustic/render.png")
+    of_design = picture.read_bytes()
+    assert "so it is kept" in run("render blob.caustic --rays 500", capfd)[2] and picture.read_bytes() == of_design
     assert run("render blob.caustic --quiet --force", capfd)[0] == 0
     with Image.open(picture) as image:
         assert image.size[0] >= 800 and image.info["noise"]

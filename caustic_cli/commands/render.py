@@ -195,7 +195,7 @@ def _checked_size(asked: RenderOptions) -> list[int]:
     """
     if asked.tolerance is not None and not 0 < asked.tolerance < 100:
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {asked.tolerance:g}")
-    size = options.both(options.counts("--filter-size", asked.filter_size))
+    size = tuple(options.both(options.counts("--filter-size", asked.filter_size)))
     radius = asked.tool_radius
     if radius is not None and not ((asked.report or asked.cut) and radius > 0):
         raise InputError(f"--tool-radius belongs to --report and --cut and must be greater than 0 mm, got {radius:g}")

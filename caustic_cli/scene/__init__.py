@@ -226,5 +226,7 @@ class Scene:
 
 
 def __getattr__(name: str) -> Any:
-    """The other sources, which are loaded when they are asked for."""
-    return getattr(sources, name)
+    """The other sources of `__all__`, which are loaded when they are asked for."""
+    if name in __all__:
+        return getattr(sources, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
