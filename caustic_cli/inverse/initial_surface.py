@@ -136,7 +136,7 @@ class _Grid:
         screen = self.scene.screen
         if self.scene.behind:
             return RelayedScreen(self.scene, mean)
-        return None if screen.upright else ScreenProjection(screen, mean, -1.0 if self.scene.lens.mirror else 1.0)
+        return None if screen.upright else ScreenProjection(screen, mean, self.scene.lens.interaction.side)
 
     def above(self, z: np.ndarray) -> np.ndarray:
         """Fraction of the corners of each cell where the surface is not truncated."""

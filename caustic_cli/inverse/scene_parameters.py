@@ -140,7 +140,7 @@ class Ranges:
         """
         at = dict(zip(self.keys, values, strict=True))
         if "throw" in at:
-            z = -at["throw"] if scene.lens.mirror else at["throw"]
+            z = scene.lens.interaction.side * at["throw"]
             scene = replace(scene, screen=replace(scene.screen, z=z))
         if any(key.startswith("source.") for key in at):
             source = scene.source

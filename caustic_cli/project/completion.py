@@ -28,6 +28,7 @@ from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.kinds import complete_design, kind_of
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.scene import Offset, Source, sources
+from caustic_cli.scene.interaction import Interior, interaction_of
 from caustic_cli.scene.light import RGB
 from caustic_cli.schema.table import LensSettings, Parameters, ScreenSettings, SourceSettings, TargetSettings, check
 
@@ -93,7 +94,7 @@ def _in_colour(s: Settings) -> Settings:
 
 def _placed(s: Settings, by: Parameters, aspect: float, placed: bool, over: Ranges | None) -> ScreenSettings:
     """The screen at its distance, with the size and the pixels that are given; placed: whether its distance is given as such."""
-    screen, side = s.screen, -1.0 if s.lens.mirror else 1.0
+    screen, side = s.screen, interaction_of(s.lens.mirror).side
     if by.throw is not None:
         screen = screen.changed(z=side * by.throw)
     elif not placed:
@@ -162,17 +163,16 @@ def complete_lens(s: Settings, source: Source) -> LensSettings:
     lens = lens.filled(index=index) if lens.glass is None else lens.filled(wavelength=lens.wavelength)
     array, z = check("lens.array", lens.array), s.screen.z
     lowest, highest = (lens.thickness + height for height in lens.height_range)
-    if lens.mirror and z >= lowest:
-        raise InputError(f"⟨screen.z⟩ must lie before the mirror, which begins at {lowest:.4g} mm, got {z:g} mm")
-    if not lens.mirror and z <= highest:
-        raise InputError(f"⟨screen.z⟩ must lie behind the lens, which is up to {highest:.4g} mm thick, got {z:g} mm")
+    interaction = interaction_of(lens.mirror)
+    interaction.check_room(z, lowest, highest)
     if "radius" not in lens:
         # The pictures of lenslets are superimposed: the light through their centres converges like that of a focusing lens.
         across, along = (t / w if k == 1 else 0.0 for t, w, k in zip(s.target.size, lens.size, array, strict=True))
         vergence = 0.0
         if source.nearest < lens.z_in:  # vergence at the surface, 1/mm; 0 for a source at infinity
-            vergence = 1.0 / (lens.z_in - source.centre[2] + (lens.thickness - lens.z_in) / (1.0 if lens.mirror else index))
-        radius = Offset.for_magnification((across, along), -1.0 if lens.mirror else index, z, lens.thickness, vergence).radius
+            inside = interaction.interior(Interior(index)).index
+            vergence = 1.0 / (lens.z_in - source.centre[2] + (lens.thickness - lens.z_in) / inside)
+        radius = Offset.for_magnification((across, along), interaction.effective_index(index), z, lens.thickness, vergence).radius
         least = STEEPEST * math.hypot(*lens.size) / 2.0  # an oblong picture or a near source may ask for a smaller radius
         lens = lens.changed(radius=[math.copysign(max(abs(r), least), r) for r in radius])
     return lens.changed(thickness=lens.thickness + _missing_room(lens)) if adaptable and kind.adapts else lens

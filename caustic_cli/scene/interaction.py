@@ -93,6 +93,15 @@ class Refracting:
         if z <= z_in:
             raise InputError(f"⟨screen.z⟩ must lie behind the lens (beyond z_in = {z_in:g} mm), got {z:g} mm")
 
+    def check_room(self, z: float, lowest: float, highest: float) -> None:
+        """Check that a screen at z is beyond every height of the surface, from lowest to highest.
+
+        Raises:
+            InputError: it is not.
+        """
+        if z <= highest:
+            raise InputError(f"⟨screen.z⟩ must lie behind the lens, which is up to {highest:.4g} mm thick, got {z:g} mm")
+
 
 @dataclass(frozen=True)
 class Reflecting(Refracting):
@@ -150,3 +159,13 @@ class Reflecting(Refracting):
 
     def check_screen(self, z: float, z_in: float) -> None:
         """The surface itself decides, see `optics.trace.check_clearance`."""
+
+    def check_room(self, z: float, lowest: float, highest: float) -> None:
+        """As for a lens, on the other side."""
+        if z >= lowest:
+            raise InputError(f"⟨screen.z⟩ must lie before the mirror, which begins at {lowest:.4g} mm, got {z:g} mm")
+
+
+def interaction_of(mirror: bool) -> Refracting | Reflecting:
+    """What the free-form surface of a lens, or of a mirror, does with light."""
+    return Reflecting() if mirror else Refracting()

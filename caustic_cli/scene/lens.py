@@ -19,7 +19,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of
 from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.gradient import Gradient
-from caustic_cli.scene.interaction import Interior, Reflecting, Refracting
+from caustic_cli.scene.interaction import Interior, Reflecting, Refracting, interaction_of
 from caustic_cli.schema import checks
 from caustic_cli.schema.table import TABLE, check, check_all, default
 
@@ -182,7 +182,7 @@ class Lens:
     @property
     def interaction(self) -> Refracting | Reflecting:
         """What its surface does with light."""
-        return Reflecting() if self.mirror else Refracting()
+        return interaction_of(self.mirror)
 
     @property
     def kind(self) -> str:

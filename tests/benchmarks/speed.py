@@ -148,6 +148,7 @@ import sys, time
 sys.path.insert(0, {here!r})
 import speed, torch
 from caustic_cli.inverse.objective import Objective
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.trace import expose
 from caustic_cli.optics.reconstruction import Filter
@@ -157,7 +158,7 @@ if {what!r} == "render":
     expose(s, field, heights, Sampler.of_size("stratified", {rays}))
 else:
     rays, target = Sampler.of_size("lines", {rays}), torch.ones(250, 250).double()
-    Objective(s, field, rays, Filter("cosine", (3, 3)), target, "rms-light")(heights)
+    Objective(s, field, rays, target, "rms-light", LossImage(Filter("cosine", (3, 3))))(heights)
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))  # this process alone, from its start
 print(int(peak.split()[1]) / 1024, time.perf_counter() - began)
 """
