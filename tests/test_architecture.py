@@ -165,6 +165,7 @@ ELSEWHERE = {
     ("io/files.py", "open"),
     ("io/files.py", "os.open"),
     ("config/presets/__init__.py", "path.read_text"),
+    ("scene/spectrum.py", "path.read_text"),
     ("export/page/__init__.py", "(here / f'page.{kind}').read_text"),
     ("optics/kernels/cache.py", "p.read_bytes"),
     ("optics/kernels/cache.py", "path.read_bytes"),
