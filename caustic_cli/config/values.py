@@ -13,9 +13,11 @@ from typing import Any
 from caustic_cli.config import settings, tolerances
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.loss_terms import parse
+from caustic_cli.loading import OnDemand
 from caustic_cli.scene import materials, sources
 from caustic_cli.schema.table import TABLE
 
+spectrum = OnDemand("caustic_cli.scene.spectrum")
 #: Words of design.start that are no file.
 STARTS = ("transport", "offset")
 
@@ -85,16 +87,22 @@ def _existing(value: str) -> None:
         raise InputError(f"{value}: no such file")
 
 
+def _spectrum(value: str) -> None:
+    if not Path(value).suffix:
+        spectrum.built_in(value)
+
+
 #: Checks of names that the table does not list.
 NAMES: dict[str, Callable[[str], Any]] = {
     "source.type": sources.type_of,
     "lens.glass": materials.material,
     "design.loss": parse,
+    "source.spectrum": _spectrum,
 }
 #: Checks of files that options name.  Those named in a configuration or a project are relative to its directory, or not needed any
 #: more.
 FILES: dict[str, Callable[[str], Any]] = {
-    **{row.path: _existing for row in TABLE.values() if row.file and row.option and row.default is None},
+    **{row.path: _existing for row in TABLE.values() if row.file and row.option and row.default is None and not row.worded},
     "design.start": _start,
     "design.robust": lambda value: tolerances.read(Path(value)),
 }

@@ -8,7 +8,7 @@ from caustic_cli.config.default_stages import LEAST_WAVES, Table, on_waves, wave
 from caustic_cli.config.exclusions import refuse_excluded, why_excluded
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen, build_source
 from caustic_cli.effort import Effort
-from caustic_cli.optics.resolution import BAND, Resolution, white
+from caustic_cli.optics.resolution import Resolution
 from caustic_cli.scene import Scene, Source
 
 
@@ -37,10 +37,11 @@ def wave_stages(s: Settings, source: Source, effort: Effort, lit: tuple[float, f
     seen = _resolution(s, source)
     if asked == "auto" and (seen.source > seen.pixel or not seen.matters):
         return []
-    own = s.source.get("wavelengths", ())
+    light = build_light(s)
+    own, whole = tuple(map(float, s.source.get("wavelengths", ()))), light.continuum
     plan = wave_refinement(_wave_samples(s, seen, lit), len(own), effort, timed=asked == "auto")
     apron = math.ceil(0.04 * max(screen.resolution))
-    return [on_waves(lens.control, list(map(float, own)) or white(count), apron, n) for count, n in plan]
+    return [on_waves(lens.control, own if own or whole is None else whole.rule(count)[0], apron, n) for count, n in plan]
 
 
 def _resolution(s: Settings, source: Source) -> Resolution:
@@ -52,7 +53,7 @@ def _resolution(s: Settings, source: Source) -> Resolution:
 def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
     """Estimated number of samples of the field at one wavelength: space-bandwidth product of the lens and the blurred bright
     region."""
-    throw, shortest = abs(s.screen.z), min(s.source.get("wavelengths", ()) or BAND[:1]) * 1e-6
+    throw, shortest = abs(s.screen.z), min(build_light(s).lines()[0]) * 1e-6
     return math.prod(
         w * (part * t + 4.0 * seen.diffraction) / (shortest * throw)
         for w, t, part in zip(s.lens.size, s.target.size, lit, strict=True)

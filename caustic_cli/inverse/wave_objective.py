@@ -60,7 +60,7 @@ class WaveObjective:
         field: spline spaces of the heights.
         heights: h_0 (n, m) mm.
         target, loss, limits: as of an `Objective`; how: only its blur and apron apply.
-        wavelengths: nm, of equal weight, for a scene that gives none; empty for those of white light.
+        wavelengths: nm, of a scene with a continuous spectrum, see `Light.lines`; empty for those of the verdict.
         dtype: of fields; paths are float64.
 
     Raises:
@@ -88,7 +88,7 @@ class WaveObjective:
         wide = torch.nn.functional.pad(target.double().to(device), (how.apron,) * 4)
         self.loss = (Loss if target.ndim == 2 else ColorLoss)(loss, wide, how.blur, how.apron, wide > 0)
         self.penalty = penalty_of(scene, field, loss, limits or Limits(), device)
-        lines = lines_of(scene, field, None if scene.light.wavelengths else wavelengths or None)
+        lines = lines_of(scene, field, None if scene.light.continuum is None else wavelengths or None)
         rank, count = ranks.rank_and_size()
         parameters = {EXIT: self.middle}
         with torch.no_grad():

@@ -17,20 +17,12 @@ from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.scene import Lens, Scene
 from caustic_cli.scene.traits import Capability
 
-#: Wavelength, nm, that represents light of unspecified wavelength, and the band of white light.
-GREEN, BAND = 550.0, (450.0, 650.0)
-#: Number of wavelengths that represent white light in an image.
-WHITE_LINES = 6
+#: Wavelength, nm, that represents light of unspecified wavelength.
+GREEN = 550.0
 #: Relative increase of the blur of source and pixel from which on diffraction matters.
 WIDENED = 0.05
 #: Points along each axis of the lens at which the local magnification is evaluated.
 POINTS = 128
-
-
-def white(count: int) -> tuple[float, ...]:
-    """Wavelengths, nm, that represent white light: midpoints of `count` equal parts of its band."""
-    low, high = BAND
-    return tuple(low + (k + 0.5) * (high - low) / count for k in range(count))
 
 
 def diffraction_blur(wavelength: float, throw: float, magnification: float) -> float:
@@ -55,8 +47,7 @@ class Resolution:
     def of(cls, scene: Scene, picture: float, magnification: float) -> Resolution:
         """Of a scene with a picture of this width, mm, and a lens of this (local) magnification."""
         lens, screen = scene.lens, scene.screen
-        said = scene.light.wavelengths
-        wavelength = sum(w * p for w, p in zip(said, scene.light.fractions, strict=True)) if said else GREEN
+        wavelength = scene.light.mean
         distance = abs(screen.z - lens.offset.thickness)
         return cls(
             diffraction_blur(wavelength, distance, magnification),
@@ -65,7 +56,7 @@ class Resolution:
             picture,
             lens.size[0],
             wavelength,
-            bool(said),
+            bool(scene.light.wavelengths),
         )
 
     @classmethod

@@ -15,6 +15,7 @@ import numpy as np
 
 from caustic_cli.config import settings, tolerances
 from caustic_cli.config.settings import Given, Settings
+from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import open_npy
 from caustic_cli.io.files import read_bytes
 from caustic_cli.io.picture import read_picture
@@ -25,7 +26,8 @@ from caustic_cli.scene.sources.section import Attached
 from caustic_cli.schema.table import TABLE, Section, Setting
 
 intensities, sags = OnDemand("caustic_cli.io.intensities"), OnDemand("caustic_cli.io.sags")
-rayfiles = OnDemand("caustic_cli.io.rayfiles")
+spectrum = OnDemand("caustic_cli.scene.spectrum")
+rayfiles, spectra = OnDemand("caustic_cli.io.rayfiles"), OnDemand("caustic_cli.io.spectra")
 
 #: Settings that name a file.
 ROWS = [row for row in TABLE.values() if row.file]
@@ -97,8 +99,8 @@ def names_in(given: Given) -> Iterator[tuple[dict[str, Any], Setting]]:
 
 
 def _is_file(row: Setting, value: Any) -> bool:
-    """Whether a value names a file: one that may be a word, such as the default, does so by a suffix."""
-    return isinstance(value, str) and value != "" and (not row.default or bool(Path(value).suffix))
+    """Whether a value names a file: one that may be a word, too, does so by a suffix."""
+    return isinstance(value, str) and value != "" and (not row.worded or bool(Path(value).suffix))
 
 
 def rays_of(name: str) -> RaySet:
@@ -137,6 +139,13 @@ def _second(path: Path, given: Given) -> _Read:
     return _Read(picture.encoded(), picture.irradiance(), picture.suffix)
 
 
+def _spectrum(path: Path, _given: Given) -> _Read:
+    if path.suffix.lower() != ".csv":
+        raise InputError(f"⟨source.spectrum⟩ {path}: {spectra.TABLE}, or one of {', '.join(spectrum.BUILT_IN)}")
+    data = read_bytes(path, spectra.MOST_BYTES, spectra.TABLE)
+    return _Read(data, spectra.parse_spectrum(data, str(path)), ".csv")
+
+
 def _index(path: Path, _given: Given) -> _Read:
     """Control values (n, m, k) of refractive index."""
     accepted = "a .npy array of (n, m) or (n, m, k) refractive indices is needed"
@@ -160,6 +169,7 @@ READERS: dict[str, Callable[[Path, Given], _Read]] = {
     "source.profile": _profile,
     "source.file": _light,
     "source.intensity": _intensity,
+    "source.spectrum": _spectrum,
     "lens.index_file": _index,
     "screen.shape_file": _sags,
     "second.file": _second,

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.loading import OnDemand
 from caustic_cli.schema.table import check
+
+if TYPE_CHECKING:
+    from caustic_cli.scene.spectrum import Measure
+
+spectra = OnDemand("caustic_cli.scene.spectrum")
 
 #: Dominant wavelengths of the sRGB primaries (IEC 61966-2-1), nm, which represent red, green and blue.
 RGB = (611.4, 549.1, 464.3)
 #: Largest number of wavelengths of one source: each takes a trace.
 MAX_WAVELENGTHS = 99
+#: Wavelengths that represent a continuous spectrum: as traced through a dispersive glass, and in the verdict on a wave image.
+RAY_NODES, WAVE_NODES = 5, 7
 
 
 @dataclass(frozen=True)
@@ -33,6 +46,9 @@ class Light:
     color: bool = False
     #: Unit of the source's power: W (radiant flux) or lm (luminous flux).
     unit: str = "W"
+    #: A continuous spectrum as its detector weights it, of which the wavelengths are samples; None for light of those wavelengths
+    #: alone, and for white light that nothing is said about.
+    measure: Measure | None = None
 
     def __post_init__(self):
         check("source.power_unit", self.unit)
@@ -68,8 +84,35 @@ class Light:
         """Leading dimensions of an image: (3,), its colour channels, or ()."""
         return (len(RGB),) if self.color else ()
 
+    @cached_property
+    def continuum(self) -> Measure | None:
+        """The continuous spectrum that the wave image is of: its own, or that of white light; None for spectral lines."""
+        return self.measure or (None if self.wavelengths else spectra.measure_of())
+
+    def lines(self, wavelengths: tuple[float, ...] = ()) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Wavelengths of its wave image, nm, and the fraction of the light that each represents.
+
+        wavelengths: those to take instead of its own lines, of equal power, or of a Gauss rule of its continuous spectrum, each for
+        its share of that.
+        """
+        if (whole := self.continuum) is None:
+            return (
+                (wavelengths, (1.0 / len(wavelengths),) * len(wavelengths)) if wavelengths else (self.wavelengths, self.fractions)
+            )
+        if not wavelengths:
+            return whole.rule(WAVE_NODES)
+        parts = dict(zip(sorted(wavelengths), whole.weights_at(np.array(sorted(wavelengths))).tolist(), strict=True))
+        return wavelengths, tuple(parts[w] for w in wavelengths)
+
+    @property
+    def mean(self) -> float:
+        """Mean wavelength, nm, as its detector sees it."""
+        if (whole := self.continuum) is not None:
+            return whole.mean
+        return math.fsum(w * p for w, p in zip(self.wavelengths, self.fractions, strict=True))
+
     @property
     def fractions(self) -> tuple[float, ...]:
-        """Fraction of the power at each wavelength; they sum to 1."""
+        """Fraction of the light at each wavelength, as its detector sees it; they sum to 1."""
         weights = self.weights or (1.0,) * len(self.wavelengths)
         return tuple(w / sum(weights) for w in weights)

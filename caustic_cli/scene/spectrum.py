@@ -39,6 +39,8 @@ BUILT_IN = {
 DETECTORS = ("eye", "power")
 #: Range of visible light, nm.
 VISIBLE = (380.0, 780.0)
+#: Range of white light of equal energy where power is measured, nm.
+BAND = (450.0, 650.0)
 #: Largest luminous efficacy of radiation, lm/W: K_m as in CIE 15:2018, which rounds 683.002.
 K_M = 683.0
 #: Wavelengths of a table, and their range, nm.
@@ -230,6 +232,11 @@ class Measure:
         weights = 1.0 / total
         return np.clip(0.5 * (low + high) + 0.5 * (high - low) * t, low, high), weights / weights.sum()
 
+    def rule(self, n: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """`nodes` as numbers."""
+        wavelengths, weights = self.nodes(n)
+        return tuple(wavelengths.tolist()), tuple(weights.tolist())
+
     def weights_at(self, wavelengths: np.ndarray) -> np.ndarray:
         """Weights (n,) of given wavelengths (n,) nm, ascending, none negative and with the sum 1.
 
@@ -328,6 +335,37 @@ class Measure:
                 break
             vector = vector / beta[-1]
         return np.array(alpha), np.array(beta)
+
+
+def luminous(wavelengths: tuple[float, ...], weights: tuple[float, ...]) -> tuple[float, ...]:
+    """Luminous flux of spectral lines (n,) nm with relative powers (n,), equal where none are given.
+
+    Raises:
+        InputError: the eye sees none of them.
+    """
+    seen = luminous_efficiency(np.array(wavelengths)) * (weights or 1.0)
+    if not seen.sum() > 0:
+        raise InputError("⟨source.wavelengths⟩: the eye sees none of them; ⟨+source.detector⟩ power measures their power")
+    return tuple(seen.tolist())
+
+
+def measure_of(spectrum: Spectrum | str = "equal", detector: str = "eye") -> Measure:
+    """A spectrum, or a built-in one by its name, as a detector weights it.
+
+    Equal energy measured by power is the white light of 450 to 650 nm by which earlier versions of this program judged.
+
+    Raises:
+        InputError: there is no such spectrum, or no power that the detector measures.
+    """
+    return _built_in_measure(spectrum, detector) if isinstance(spectrum, str) else Measure(spectrum, detector)
+
+
+@cache
+def _built_in_measure(name: str, detector: str) -> Measure:
+    found = built_in(name)
+    if (found.name, detector) == ("equal", "power"):
+        found = Spectrum(found.name, np.array(BAND), np.ones(2))
+    return Measure(found, detector)
 
 
 def _knots(spectrum: Spectrum, low: float, high: float) -> np.ndarray:

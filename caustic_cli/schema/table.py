@@ -102,6 +102,11 @@ class Setting:
         return (2 if self.section else 1) if single else 0
 
     @property
+    def worded(self) -> bool:
+        """Whether a value may be a word; one that names a file then has a suffix."""
+        return bool(self.default) or (self.option is not None and "|" in (self.option.metavar or ""))
+
+    @property
     def note(self) -> str:
         """The comment in project.toml: unit and description."""
         return ", ".join(filter(None, (self.unit, self.help)))
@@ -239,6 +244,12 @@ class SourceSettings(Section):
             *WAVELENGTHS, derived="one wavelength", option=Option("--wavelengths", "NM[:W],...", BOTH),
             speaks_for=("source.weights",))
     weights: Numbers | None = setting("relative power at each wavelength", low=0.0, high=checks.POWER, derived="equal")
+    spectrum: str | None = setting("continuous spectrum: equal (energy), daylight (D65), sun (AM1.5), led-3000, led-4000, led-6500,"
+            " halogen, or a .csv of nm and relative power per nm; wavelengths are then samples of it", derived="equal, for waves"
+            " where no wavelengths are given", option=Option("--spectrum", "NAME|FILE.csv", BOTH), file="spectrum")
+    detector: str | None = setting("what the light is measured by: eye (luminous flux) or power", choices=("eye", "power"),
+            derived="eye for a spectrum, white light and lumens; power for wavelengths", option=Option("--detector", "eye|power",
+            BOTH))
 
 
 class LensSettings(Section):
@@ -408,7 +419,8 @@ class StageSettings(Section):
     iterations: int = setting("largest number of iterations", low=0, high=10**9, default=1000, why="section 6.2.1 of the thesis")
     tolerance: float = setting("end the stage when 10 iterations reduce the loss by less than this fraction; 0: never", low=0.0,
             high=1.0, default=0.0)
-    waves: Numbers | None = setting("refine the wave image at these wavelengths, if the source has none, instead of the ray image",
+    waves: Numbers | None = setting("refine the wave image at these wavelengths, unless the source has lines, instead of the ray"
+            " image",
             "nm", *WAVELENGTHS)
 
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.optics.resolution import GREEN
 from caustic_cli.scene import Scene
 
 #: Standard deviation of a parabola's heights in parts of its depth: sqrt(4 / 45).
@@ -38,8 +37,7 @@ def scallops(scene: Scene, step: float, radius: float) -> dict:
     lens, screen = scene.lens, scene.screen
     bend, throw = abs(lens.effective_index - 1.0), abs(screen.z - lens.offset.thickness)
     pixel = max(screen.pixel)
-    said = scene.light.wavelengths
-    wavelength = sum(w * p for w, p in zip(said, scene.light.fractions, strict=True)) if said else GREEN
+    wavelength = scene.light.mean
     blur = bend * throw * step / radius
     phase = 2.0 * math.pi * bend * PARABOLA / (wavelength * 1e-6)  # standard deviation, rad, per mm of depth
     fine = PIXELS * pixel * radius / (bend * throw)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from dataclasses import replace
 
 import numpy as np
 from torch import Tensor
@@ -21,7 +21,7 @@ from caustic_cli.studies.metrics import figures_of_merit
 
 #: Oversampling of both planes for the validation.
 FINER = 1.25
-#: Wavelengths relative to a single one, for the sensitivity to the wavelength.
+#: Wavelengths relative to a spectral line, for the sensitivity to the wavelength.
 ASIDE = (0.99, 1.01)
 #: Figures of a ray image that a wave image has as well.
 _SAME = ("relative_rms", "psnr_db", "ssim", "on_target", "in_black", "on_screen")
@@ -73,22 +73,25 @@ def wave_figures(
 
 
 def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray) -> dict:
-    """Figures at wavelengths between those of the scene, or next to a single one; empty for white light.
+    """Figures at wavelengths beside the spectral lines of the scene; empty for a continuous spectrum, which is judged at other
+    wavelengths than the design's.
 
     Returns:
         wave_unseen_relative_rms and wave_unseen_wavelengths, nm, those that the glass is known at.
     """
-    own = sorted(scene.light.wavelengths)
-    if not own or scene.colored:
+    light = scene.light
+    if light.continuum is not None or scene.colored:
         return {}
-    others = tuple(0.5 * (a + b) for a, b in pairwise(own)) or tuple(a * own[0] for a in ASIDE)
-    if scene.lens.glass is not None:
-        low, high = material(scene.lens.glass).range_nm
-        others = tuple(w for w in others if low <= w <= high)
-    if not others:
+    low, high = material(scene.lens.glass).range_nm if scene.lens.glass is not None else (0.0, math.inf)
+    beside = [
+        (a * w, part) for w, part in zip(light.wavelengths, light.fractions, strict=True) for a in ASIDE if low <= a * w <= high
+    ]
+    if not beside:
         return {}
-    found = wave_image(scene, field, heights.detach(), wavelengths=others, finer=FINER)
-    return {"wave_unseen_relative_rms": _judged(found, target)["relative_rms"], "wave_unseen_wavelengths": list(others)}
+    wavelengths, weights = zip(*sorted(beside), strict=True)
+    scene = replace(scene, light=replace(light, wavelengths=wavelengths, weights=weights))
+    found = wave_image(scene, field, heights.detach(), finer=FINER)
+    return {"wave_unseen_relative_rms": _judged(found, target)["relative_rms"], "wave_unseen_wavelengths": list(wavelengths)}
 
 
 def height_deviation(surface: MeasuredSurface, field: HeightField, heights: Tensor) -> Perturbation:

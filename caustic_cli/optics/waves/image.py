@@ -22,7 +22,6 @@ from torch import Tensor
 from caustic_cli.optics.emission.coherent import Mode, central_mode, modes, outermost_modes, spots
 from caustic_cli.optics.interaction import Parameters
 from caustic_cli.optics.receiver import Receiver
-from caustic_cli.optics.resolution import WHITE_LINES, white
 from caustic_cli.optics.spread import POINT, Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
@@ -93,8 +92,8 @@ class WaveImage:
 
 
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
-    """Spectral lines of a scene, by wavelength and polarisation: its own, or the given ones with equal powers; white light if it
-    has none."""
+    """Spectral lines of a scene, by wavelength and polarisation: its own, those that represent its continuous spectrum, or those
+    at the given wavelengths, see `Light.lines`."""
     scene = scene.unfolded
     if len(scene.source.members) > 1:
         return [
@@ -102,13 +101,9 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
             for one, fraction in zip(scene.by_source, scene.source.fractions, strict=True)
             for line in lines_of(one, field, wavelengths)
         ]
-    found, own, systems = [], scene.light.wavelengths, {}
-    channels: tuple[int | None, ...]
-    if wavelengths is not None or not own:
-        given = wavelengths or white(WHITE_LINES)
-        parts, channels = (1.0 / len(given),) * len(given), (None,) * len(given)
-    else:
-        given, parts, channels = own, scene.light.fractions, scene.light.channels
+    found, systems = [], {}
+    given, parts = scene.light.lines(wavelengths or ())
+    channels = scene.light.channels if given is scene.light.wavelengths else (None,) * len(given)
     states = (0.0, 90.0) if scene.light.tracked and scene.light.polarisation is None else (scene.light.polarisation,)
     for wavelength, part, channel in zip(given, parts, channels, strict=True):
         lens = replace(scene.lens, roughness=0.0)
@@ -124,8 +119,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
 
 def lines_of_system(system: System) -> list[Line]:
     """Spectral lines of a system, source by source."""
-    given = system.light.wavelengths or white(WHITE_LINES)
-    parts = system.light.fractions if system.light.wavelengths else (1.0 / len(given),) * len(given)
+    given, parts = system.light.lines()
     return [
         Line(wavelength, fraction * part, system.with_source(source), wavelength)
         for source, fraction in zip(system.sources, system.fractions, strict=True)
@@ -148,7 +142,7 @@ def wave_image(
     """The wave image of a scene at heights (n, m) mm; differentiable by them.
 
     Args:
-        wavelengths: nm, of equal power, instead of the scene's; a scene without any has white light.
+        wavelengths: nm, instead of the scene's, see `Light.lines`.
         finer: oversampling factor along each axis of both planes.
         dtype: of the field; optical paths are float64.
         perturbation: of the exit's height, see `Imager`.

@@ -8,10 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.loading import OnDemand
 from caustic_cli.scene.aperture import Pupil
-from caustic_cli.scene.light import Light
+from caustic_cli.scene.light import RAY_NODES, Light
 from caustic_cli.scene.sources.base import Source
-from caustic_cli.scene.sources.section import Table
+from caustic_cli.scene.sources.section import Table, content
+
+spectra = OnDemand("caustic_cli.scene.spectrum")
 
 #: Largest number of sources of a scene.
 MOST = 64
@@ -149,10 +152,31 @@ class Several(Source):
 def lights_of(section: Table, color: bool = False) -> list[Light]:
     """The `Light` of each source of a [source] section: its own wavelengths, with the first's polarisation and unit of power."""
     state, unit = section.get("polarisation"), section.get("power_unit", "W")
-    return [
-        Light(state, tuple(t.get("wavelengths", ())), tuple(t.get("weights", ())), color=color, unit=unit)
-        for t in (section, *section.get("also", ()))
-    ]
+    tables = (section, *section.get("also", ()))
+    return [replace(light_of(table, unit, color), polarisation=state) for table in tables]
+
+
+def light_of(table: Table, unit: str, color: bool = False) -> Light:
+    """The spectrum of a [source] table as its detector weights it: spectral lines, of which those of a coloured picture keep their
+    power, or samples of a continuous spectrum.
+
+    Raises:
+        InputError: two settings contradict each other, or the detector measures no power.
+    """
+    wavelengths, weights = (tuple(table.get(key, ())) for key in ("wavelengths", "weights"))
+    name, detector = table.get("spectrum"), table.get("detector")
+    if name is None and wavelengths:
+        by_eye = not color and (detector or ("power" if unit == "W" else "eye")) == "eye"
+        return Light(None, wavelengths, spectra.luminous(wavelengths, weights) if by_eye else weights, color=color, unit=unit)
+    if name is None and detector is None:
+        return Light(unit=unit)
+    if weights:
+        raise InputError("⟨source.weights⟩ follow from ⟨source.spectrum⟩: give one of them")
+    measure = spectra.measure_of(content(table, "spectrum", spectra.Spectrum) or name or "equal", detector or "eye")
+    if name is None:
+        return Light(unit=unit, measure=measure)
+    given, parts = Light(measure=measure).lines(wavelengths) if wavelengths else measure.rule(RAY_NODES)
+    return Light(None, given, parts, unit=unit, measure=measure)
 
 
 def light_of_all(section: Table, color: bool = False) -> Light:
