@@ -14,7 +14,7 @@ from torch import Tensor
 from caustic_cli.optics.ray_transfer import meet
 from caustic_cli.optics.rays import RayState
 from caustic_cli.scene import Lens
-from caustic_cli.scene.materials import refractive_index
+from caustic_cli.scene.materials import nearest_index
 from caustic_cli.schema import checks
 
 
@@ -40,7 +40,7 @@ class Medium:
 
     def index_at(self, wavelength: float | None) -> float:
         """Refractive index at a wavelength, nm."""
-        return self.index if self.glass is None or wavelength is None else refractive_index(self.glass, wavelength)
+        return self.index if self.glass is None or wavelength is None else nearest_index(self.glass, wavelength)
 
     @property
     def effects(self) -> frozenset[str]:

@@ -22,7 +22,7 @@ from caustic_cli.scene.elements import (
 from caustic_cli.scene.freeform import FreeForm, SecondTarget
 from caustic_cli.scene.lens import Lens, Offset
 from caustic_cli.scene.light import Light
-from caustic_cli.scene.materials import refractive_index
+from caustic_cli.scene.materials import nearest_index, refractive_index
 from caustic_cli.scene.screen import Screen
 from caustic_cli.scene.sources import PlaneWave, Source
 
@@ -94,7 +94,7 @@ class Scene:
                 f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
                 f" got z = {self.source.nearest:g} mm"
             )
-        if self.dispersive:
+        if self.dispersive and self.light.measure is None:
             for wavelength in self.light.wavelengths:
                 for glass in self.glasses:
                     refractive_index(glass, wavelength)
@@ -159,7 +159,7 @@ class Scene:
 
     def at(self, wavelength: float) -> Scene:
         """The scene with every glass' refractive index evaluated at a wavelength, nm."""
-        lens = self.lens if self.lens.glass is None else replace(self.lens, index=refractive_index(self.lens.glass, wavelength))
+        lens = self.lens if self.lens.glass is None else replace(self.lens, index=nearest_index(self.lens.glass, wavelength))
         return replace(self, lens=lens, elements=tuple(e.at(wavelength) for e in self.elements))
 
     @property

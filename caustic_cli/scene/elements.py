@@ -21,7 +21,7 @@ from caustic_cli.errors import InputError, at_least
 from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of
 from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.interaction import Reflecting, Refracting
-from caustic_cli.scene.materials import refractive_index
+from caustic_cli.scene.materials import nearest_index
 from caustic_cli.scene.screen import Screen, Window, tilted
 from caustic_cli.scene.traits import Capability
 from caustic_cli.schema.table import check, default
@@ -162,7 +162,7 @@ class Component:
 
     def at(self, wavelength: float) -> Component:
         """The component with its index evaluated at a wavelength, nm."""
-        return self if self.glass is None else replace(self, index=refractive_index(self.glass, wavelength))
+        return self if self.glass is None else replace(self, index=nearest_index(self.glass, wavelength))
 
 
 @dataclass(frozen=True)

@@ -141,6 +141,13 @@ def refractive_index(name: str, wavelength: float = D_LINE) -> float:
     return glass.index(wavelength)
 
 
+def nearest_index(name: str, wavelength: float) -> float:
+    """Refractive index of a material at the nearest wavelength, nm, within the range of its formula: a continuous spectrum has ends
+    of little weight beyond it."""
+    low, high = material(name).range_nm
+    return refractive_index(name, min(max(wavelength, low), high))
+
+
 def described() -> list[dict[str, Any]]:
     """The materials for JSON: name, n_d and its spread between batches, Abbe number V_d, density in g/cm^3 or None, steepest_slope
     in mm per mm, range_nm, source, and other names; see `Material`."""

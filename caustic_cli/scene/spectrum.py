@@ -39,6 +39,8 @@ BUILT_IN = {
 DETECTORS = ("eye", "power")
 #: Range of visible light, nm.
 VISIBLE = (380.0, 780.0)
+#: Range of the nodes for the eye, which sees 0.1 % of the light of equal energy outside, nm.
+SEEN = (400.0, 700.0)
 #: Range of white light of equal energy where power is measured, nm.
 BAND = (450.0, 650.0)
 #: Largest luminous efficacy of radiation, lm/W: K_m as in CIE 15:2018, which rounds 683.002.
@@ -52,10 +54,10 @@ INVISIBLE = 0.01
 MOST_NODES = 128
 #: Intervals of the discretisation over the whole range, at least, and Gauss-Legendre points of each.
 INTERVALS, POINTS = 400, 8
-#: beta_k, relative to half the range, at which the recurrence ends: the nodes carry the whole density to rounding.
-LEAST_BETA = 1e-10
-#: Negative weight that counts as a rounding error.
-ROUNDING = 1e-12
+#: beta_k at which the recurrence ends, nm: more nodes would resolve only the width of lines as narrow as that.
+LEAST_BETA = 1e-6
+#: Weight, of either sign, that counts as 0, and error of an integral that counts as none.
+ROUNDING, EXACT = 1e-12, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +167,9 @@ def white_point(spectrum: Spectrum) -> tuple[float, float, float]:
 class Measure:
     """A spectrum as a detector weights it: a density w over wavelength.
 
-    It is restricted to 380 to 780 nm, since pictures are for visible light, for which glasses and plastics are made and specified;
-    the infrared of the sun must not move the wavelengths for which a lens is designed.  The exception is a source of which less
+    It is restricted to 400 to 700 nm for the eye, and to 380 to 780 nm else, since pictures are for visible light, for which glasses
+    and plastics are made and specified; the infrared of the sun must not move the wavelengths for which a lens is designed, nor a
+    thousandth of its light take one of its few nodes.  The exception is a source of which less
     than 1% of the power is visible, an infrared lamp, measured by power: it keeps its own range.
 
     Raises:
@@ -182,7 +185,7 @@ class Measure:
         if self.detector not in DETECTORS:
             raise InputError(f"the detector must be {alternatives(DETECTORS)}, got {self.detector!r}")
         if not self._total > 0:
-            low, high = VISIBLE
+            low, high = SEEN
             raise InputError(f"{self.spectrum.name}: has no power that the eye sees, {low:g} to {high:g} nm")
 
     @cached_property
@@ -212,8 +215,8 @@ class Measure:
     def nodes(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Gauss rule of n nodes: wavelengths (n,) nm, ascending and within `range`, and weights (n,), positive with the sum 1.
 
-        Fewer where the density carries no more: that of two lines, so narrow that rounding hides their width, has two nodes.  A
-        node may lie between two lines, where the density is 0; its weight is small.
+        Fewer where the density carries no more, as that of two lines narrower than LEAST_BETA, and without nodes of no weight.  A
+        node between two lines, where the density is 0, has a small weight.
 
         Raises:
             InputError: n is not 1 to MOST_NODES.
@@ -221,16 +224,11 @@ class Measure:
         if not 1 <= n <= MOST_NODES:
             raise InputError(f"the number of wavelengths must be 1 to {MOST_NODES}, got {n}")
         alpha, beta = self._recurrence(n)
-        n = len(alpha)
         t = np.linalg.eigvalsh(np.diag(alpha) + np.diag(beta[:-1], 1) + np.diag(beta[:-1], -1))
-        before, p = np.zeros(n), np.ones(n)
-        total = np.ones(n)
-        for k in range(n - 1):  # Christoffel numbers 1 / sum p_k^2: accurate also where they are small
-            before, p = p, ((t - alpha[k]) * p - (beta[k - 1] if k else 0.0) * before) / beta[k]
-            total += p * p
+        weights = 1.0 / (_polynomials(alpha, beta, t) ** 2).sum(0)  # Christoffel numbers: accurate also where they are small
+        kept = weights > ROUNDING
         low, high = self.range
-        weights = 1.0 / total
-        return np.clip(0.5 * (low + high) + 0.5 * (high - low) * t, low, high), weights / weights.sum()
+        return np.clip(0.5 * (low + high) + 0.5 * (high - low) * t[kept], low, high), weights[kept] / weights[kept].sum()
 
     def rule(self, n: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """`nodes` as numbers."""
@@ -240,8 +238,8 @@ class Measure:
     def weights_at(self, wavelengths: np.ndarray) -> np.ndarray:
         """Weights (n,) of given wavelengths (n,) nm, ascending, none negative and with the sum 1.
 
-        They are those of the interpolatory rule, exact for polynomials of degree n - 1 and those of the Gauss rule at its nodes,
-        unless one is negative: then the integrals of w over the cells of wavelengths nearest to each.
+        They are those of the interpolatory rule, exact for polynomials of degree n - 1 and equal to those of the Gauss rule at its
+        nodes, unless one is negative: then the integrals of w over the cells of wavelengths nearest to each.
 
         Raises:
             InputError: the wavelengths do not ascend.
@@ -249,29 +247,33 @@ class Measure:
         at = np.asarray(wavelengths, dtype=np.float64)
         if at.ndim != 1 or not len(at) or not np.isfinite(at).all() or not (np.diff(at) > 0).all():
             raise InputError("wavelengths must be finite and ascend")
-        if len(at) <= MOST_NODES:
-            weights = self._interpolatory(at)
-            if np.isfinite(weights).all() and weights.min() >= -ROUNDING and abs(weights.sum() - 1.0) < 1e-6:
-                weights = np.maximum(weights, 0.0)
-                return weights / weights.sum()
-        weights = np.maximum(np.diff(self._cumulative(0.5 * (at[1:] + at[:-1])), prepend=0.0, append=1.0), 0.0)
+        weights = self._interpolatory(at) if len(at) <= MOST_NODES else None
+        if weights is None or weights.min() < -ROUNDING:
+            weights = np.diff(self._cumulative(0.5 * (at[1:] + at[:-1])), prepend=0.0, append=1.0)
+        weights = np.maximum(weights, 0.0)
         return weights / weights.sum()
 
-    def _interpolatory(self, at: np.ndarray) -> np.ndarray:
-        """Integrals of w and each Lagrange polynomial, by the barycentric formula (Berrut and Trefethen, SIAM Rev. 46, 501
-        (2004)); not finite where it overflows."""
-        x, weights = self._points
-        apart = at[:, None] - at
-        np.fill_diagonal(apart, 1.0)
-        logs = -np.log(np.abs(apart)).sum(1)
-        factors = np.where((np.arange(len(at)) - len(at)) % 2, 1.0, -1.0) * np.exp(logs - logs.max())
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            terms = factors[:, None] / (x - at[:, None])
-            values = terms / terms.sum(0)
-        hit, where = np.nonzero(x == at[:, None])
-        values[:, where] = 0.0
-        values[hit, where] = 1.0
-        return values @ weights
+    def _interpolatory(self, at: np.ndarray) -> np.ndarray | None:
+        """The weights whose sums with all p_k, k < n, are the integrals with w, that is 1 for p_0 and else 0.
+
+        The matrix of the p_k is orthogonal at Gauss nodes once its columns are scaled.  None where it is singular to rounding, or
+        the density carries fewer nodes.
+        """
+        alpha, beta = self._recurrence(len(at))
+        if len(alpha) < len(at):
+            return None
+        low, high = self.range
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = _polynomials(alpha, beta, (at - 0.5 * (low + high)) / (0.5 * (high - low)))
+            scale = np.linalg.norm(values, axis=0)
+        if not np.isfinite(scale).all():
+            return None
+        wanted = np.eye(len(at))[0]
+        try:
+            weights = np.linalg.solve(values / scale, wanted) / scale
+        except np.linalg.LinAlgError:
+            return None
+        return weights if np.abs(values @ weights - wanted).max() < EXACT else None
 
     def _cumulative(self, at: np.ndarray) -> np.ndarray:
         """Integral of w up to wavelengths, exact."""
@@ -289,7 +291,7 @@ class Measure:
     @cached_property
     def _knots(self) -> np.ndarray:
         """Wavelengths between which w is a polynomial, of degree 2 at most: those of both tables, nm."""
-        spectrum, (low, high) = self.spectrum, VISIBLE
+        spectrum, (low, high) = self.spectrum, SEEN if self.detector == "eye" else VISIBLE
         first, last = spectrum.wavelengths[[0, -1]]
         if self.detector == "power":
             everything, visible = (
@@ -317,9 +319,10 @@ class Measure:
         return x[weights > 0], weights[weights > 0] / weights.sum()
 
     def _recurrence(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """alpha_k and beta_k, (m,) each with m <= n, of wavelengths that are scaled to -1 to 1 over `range`."""
+        """alpha_k and beta_k, k < m <= n, (m,) each, of wavelengths that are scaled to -1 to 1 over `range`."""
         x, weights = self._points
         low, high = self.range
+        least = LEAST_BETA / (0.5 * (high - low))
         t = (x - 0.5 * (low + high)) / (0.5 * (high - low))
         basis = np.empty((n, len(t)))
         vector = np.sqrt(weights)
@@ -331,7 +334,7 @@ class Measure:
             for _ in range(2):  # orthogonal to working precision
                 vector = vector - basis[: k + 1].T @ (basis[: k + 1] @ vector)
             beta.append(float(np.linalg.norm(vector)))
-            if beta[-1] < LEAST_BETA:
+            if beta[-1] < least:
                 break
             vector = vector / beta[-1]
         return np.array(alpha), np.array(beta)
@@ -366,6 +369,14 @@ def _built_in_measure(name: str, detector: str) -> Measure:
     if (found.name, detector) == ("equal", "power"):
         found = Spectrum(found.name, np.array(BAND), np.ones(2))
     return Measure(found, detector)
+
+
+def _polynomials(alpha: np.ndarray, beta: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """p_k (m, n) at scaled wavelengths (n,), k < m by the recurrence (m,): t p_k = beta_k p_k+1 + alpha_k p_k + beta_k-1 p_k-1."""
+    p = [np.ones_like(t)]
+    for k in range(len(alpha) - 1):
+        p.append(((t - alpha[k]) * p[k] - (beta[k - 1] * p[k - 1] if k else 0.0)) / beta[k])
+    return np.array(p)
 
 
 def _knots(spectrum: Spectrum, low: float, high: float) -> np.ndarray:

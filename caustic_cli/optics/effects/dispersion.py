@@ -8,7 +8,7 @@ from torch import Tensor
 
 from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Light, Scene
-from caustic_cli.scene.materials import D_LINE, refractive_index
+from caustic_cli.scene.materials import D_LINE, nearest_index, refractive_index
 
 #: Glass and wavelengths, nm, for the measurement in a scene without dispersion.
 GLASS, LINES = "N-BK7", (486.1, D_LINE, 656.3)
@@ -23,7 +23,7 @@ class Dispersion(Effect):
     def decide(self, scene: Scene, bounds) -> Decision:
         """Needed if several wavelengths pass a glass."""
         if scene.dispersive:
-            spans = {glass: [refractive_index(glass, w) for w in scene.light.wavelengths] for glass in scene.glasses}
+            spans = {glass: [nearest_index(glass, w) for w in scene.light.wavelengths] for glass in scene.glasses}
             glass, indices = max(spans.items(), key=lambda item: max(item[1]) - min(item[1]))
             why = (
                 f"{len(scene.light.wavelengths)} wavelengths in {glass}, whose index goes from {min(indices):.5f} to"

@@ -31,7 +31,7 @@ from caustic_cli.optics.waves.tilted import power_on_tilted
 from caustic_cli.optics.waves.unsupported import NoWaveImage, receiver_of
 from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, distance_of, survey, wavefront
 from caustic_cli.scene import Light, Scene, Screen, Source
-from caustic_cli.scene.materials import refractive_index
+from caustic_cli.scene.materials import nearest_index
 
 NM = 1e-6
 #: Transform samples per second on two cores; largest number of samples of a wave image that was not requested explicitly.
@@ -108,7 +108,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
     for wavelength, part, channel in zip(given, parts, channels, strict=True):
         lens = replace(scene.lens, roughness=0.0)
         if (glass := lens.interior.glass) is not None:
-            lens = replace(lens, index=refractive_index(glass, wavelength))
+            lens = replace(lens, index=nearest_index(glass, wavelength))
         for state in states:
             if (lens.index, state) not in systems:  # light of one index and polarisation takes the same paths
                 one = replace(scene, lens=lens, light=Light(state))
