@@ -29,6 +29,7 @@ from rich.text import Text
 
 from caustic_cli.errors import LISTS, MARK, InputError, plain_name, shortened
 from caustic_cli.schema.table import TABLE
+from caustic_cli.studies.irradiance import in_units
 
 #: Seconds between lines of --progress json.
 LINE_EVERY = 0.5
@@ -273,16 +274,18 @@ def _noise(figures: dict, key: str, form: str = ".2g") -> str:
 def _error(figures: dict, by_waves: bool) -> str:
     """The judged figure and its judge."""
     if by_waves:
-        return f"{_number(figures, 'wave_relative_rms', '.4f')} by waves, {_wavelengths(figures['wave_wavelengths'])}"
+        return f"{_number(figures, 'wave_relative_rms', '.4f')} by waves, {_wavelengths(figures)}"
     beside = " by rays" if figures.get("wave_relative_rms") is not None else ""
     return _number(figures, "relative_rms", ".4f") + beside + _noise(figures, "noise")
 
 
-def _wavelengths(values: list[float]) -> str:
-    """Wavelengths as a clause."""
-    if len(values) == 1:
-        return f"at {values[0]:.4g} nm"
-    return f"at {len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
+def _wavelengths(figures: dict) -> str:
+    """Wavelengths of the wave image as a clause, with what they represent, or what there is beside them."""
+    values, spectrum, beside = figures["wave_wavelengths"], figures.get("wave_spectrum"), figures.get("wave_unseen_relative_rms")
+    at = f"{values[0]:.4g} nm" if len(values) == 1 else f"{len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
+    if spectrum is not None:
+        return f"at {at}, of the spectrum {spectrum} by {'the eye' if figures['wave_detector'] == 'eye' else 'power'}"
+    return f"at {at}" if beside is None else f"at {at}, those of the design; {beside:.4f} at wavelengths 1 % beside"
 
 
 def _of_start(figures: dict) -> list[tuple[str, str]]:
@@ -323,14 +326,11 @@ def _of_image(figures: dict, prefix: str) -> list[tuple[str, str]]:
         noise = "" if prefix else _noise(figures, "in_black_noise", ".2%")
         rows.append(("light in black", _number(figures, f"{prefix}in_black", ".2%") + noise))
     if figures.get(f"{prefix}peak_irradiance") is not None:
-        name = "illuminance" if figures["irradiance_unit"] == "lux" else "irradiance"
-        rows.append((name, _irradiance(figures, prefix)))
+        rows += [(name, f"peak {peak:.4g} {unit}, mean {mean:.4g} {unit}") for name, unit, peak, mean in in_units(figures, prefix)]
+    if figures.get("luminous_flux"):
+        each = f"{figures['luminous_efficacy']:.4g} lm/W"
+        rows.append(("power of the source", f"{figures['radiant_flux']:.4g} W, {figures['luminous_flux']:.4g} lm ({each})"))
     return rows
-
-
-def _irradiance(figures: dict, prefix: str) -> str:
-    """Peak and mean of an image on the screen, in its unit."""
-    return ", ".join(f"{k} {figures[f'{prefix}{k}_irradiance']:.4g} {figures['irradiance_unit']}" for k in ("peak", "mean"))
 
 
 def _of_radius(figures: dict) -> list[tuple[str, str]]:
@@ -371,7 +371,7 @@ def _wave_image(figures: dict) -> list[tuple[str, str]]:
         return [("wave image", f"none: {figures['no_wave_image']}")]
     if "wave_wavelengths" not in figures:
         return []
-    at = _wavelengths(figures["wave_wavelengths"])
+    at = _wavelengths(figures)
     if figures["wave_relative_rms"] is None:  # an archive has no target picture
         return [("wave image", f"on the screen {_number(figures, 'wave_on_screen', '.2%')}, {at}")]
     words = f"relative RMS error {_number(figures, 'wave_relative_rms', '.4f')}, {at}"

@@ -164,20 +164,28 @@ def _glass(lens: Lens) -> dict[str, np.ndarray]:
 
 
 def _light(light: Light) -> dict[str, np.ndarray]:
-    """Optional keys of the light: source_power_unit, unless W; source_wavelengths (k,), nm, with source_weights (k,); source_color,
-    1, if these are those of a coloured picture; source_polarisation, degrees from +x."""
+    """Optional keys of the light: source_power_unit, unless W; source_wavelengths (k,), nm, with source_weights (k,); where they
+    are samples of a continuous spectrum, source_spectrum (m, 2), nm and relative power per nm, and source_detector, eye or power;
+    source_efficacy, lm/W, if known; source_color, 1, if these are those of a coloured picture; source_polarisation, degrees from
+    +x."""
     found = {} if light.unit == "W" else {"source_power_unit": np.array(light.unit)}
     found |= _spectrum(light)
+    if light.efficacy is not None:
+        found["source_efficacy"] = _reals(light.efficacy)
     if light.color:
         found["source_color"] = np.array(1, np.int64)
     return found if light.polarisation is None else found | {"source_polarisation": _reals(light.polarisation)}
 
 
 def _spectrum(light: Light) -> dict[str, np.ndarray]:
-    """Its wavelengths and weights."""
+    """Its wavelengths and weights, and the continuous spectrum that they are samples of."""
+    found = {}
+    if (measure := light.measure) is not None:
+        whole = measure.spectrum
+        found = {"source_spectrum": np.stack([whole.wavelengths, whole.power], 1), "source_detector": np.array(measure.detector)}
     if not light.wavelengths:
-        return {}
-    return {"source_wavelengths": _reals(light.wavelengths), "source_weights": _reals(light.fractions)}
+        return found
+    return found | {"source_wavelengths": _reals(light.wavelengths), "source_weights": _reals(light.fractions)}
 
 
 def _entrance(scene: Scene) -> dict[str, np.ndarray]:

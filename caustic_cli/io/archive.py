@@ -28,13 +28,14 @@ from caustic_cli.scene.sources.points import MAX_POINTS
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import MOST, Several
+from caustic_cli.scene.spectrum import MOST_ROWS, Measure, Spectrum
 from caustic_cli.schema.table import check
 
 #: Keys of a source and of its spectrum.
 KEYS = (
     *("cone_half_angle", "source_type", "source_positions", "source_power", "source_profile", "source_size", "source_angle"),
     *("source_intensity", "source_intensity_table", "source_brightness", "source_rays_sha256"),
-    *("source_wavelengths", "source_weights"),
+    *("source_wavelengths", "source_weights", "source_spectrum", "source_detector", "source_efficacy"),
 )
 #: Most cells along an axis of a picture of a source.
 MOST_CELLS = 1 << 16
@@ -80,7 +81,24 @@ def _light(data: Archive) -> Light:
     """Wavelengths and polarisation; see `export/lighttools.py`."""
     wavelengths, weights = _spectrum(data)
     polarisation = data.real("source_polarisation") if "source_polarisation" in data else None
-    return Light(polarisation, wavelengths, weights, color="source_color" in data, unit=data.text("source_power_unit", "W"))
+    return Light(
+        polarisation,
+        wavelengths,
+        weights,
+        color="source_color" in data,
+        unit=data.text("source_power_unit", "W"),
+        measure=_measure(data),
+        efficacy=data.real("source_efficacy") if "source_efficacy" in data else None,
+    )
+
+
+def _measure(data: Archive) -> Measure | None:
+    """The continuous spectrum, or None."""
+    if "source_spectrum" not in data:
+        return None
+    columns = data.reals("source_spectrum", None, 2, most=MOST_ROWS)
+    with naming("source_spectrum"):
+        return Measure(Spectrum("source_spectrum", *columns.T), data.text("source_detector", "eye"))
 
 
 def _spectrum(data: Archive) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -49,6 +49,8 @@ class Light:
     #: A continuous spectrum as its detector weights it, of which the wavelengths are samples; None for light of those wavelengths
     #: alone, and for white light that nothing is said about.
     measure: Measure | None = None
+    #: Luminous efficacy of radiation, lm/W; None where nothing is said about its spectrum.
+    efficacy: float | None = None
 
     def __post_init__(self):
         check("source.power_unit", self.unit)

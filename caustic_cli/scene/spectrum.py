@@ -167,9 +167,9 @@ def white_point(spectrum: Spectrum) -> tuple[float, float, float]:
 class Measure:
     """A spectrum as a detector weights it: a density w over wavelength.
 
-    It is restricted to 400 to 700 nm for the eye, and to 380 to 780 nm else, since pictures are for visible light, for which glasses
-    and plastics are made and specified; the infrared of the sun must not move the wavelengths for which a lens is designed, nor a
-    thousandth of its light take one of its few nodes.  The exception is a source of which less
+    It is restricted to 400 to 700 nm for the eye, and to 380 to 780 nm for power, since pictures are for visible light, for which
+    glasses and plastics are made and specified; the infrared of the sun must not move the wavelengths for which a lens is designed,
+    nor a thousandth of the visible light take one of its few nodes.  The exception is a source of which less
     than 1% of the power is visible, an infrared lamp, measured by power: it keeps its own range.
 
     Raises:
@@ -340,16 +340,12 @@ class Measure:
         return np.array(alpha), np.array(beta)
 
 
-def luminous(wavelengths: tuple[float, ...], weights: tuple[float, ...]) -> tuple[float, ...]:
-    """Luminous flux of spectral lines (n,) nm with relative powers (n,), equal where none are given.
-
-    Raises:
-        InputError: the eye sees none of them.
-    """
-    seen = luminous_efficiency(np.array(wavelengths)) * (weights or 1.0)
-    if not seen.sum() > 0:
-        raise InputError("⟨source.wavelengths⟩: the eye sees none of them; ⟨+source.detector⟩ power measures their power")
-    return tuple(seen.tolist())
+def luminous(wavelengths: tuple[float, ...], weights: tuple[float, ...] = ()) -> tuple[tuple[float, ...], float]:
+    """Relative luminous flux (n,) of spectral lines (n,) nm with relative powers (n,), equal where none are given, and the luminous
+    efficacy of all, lm/W."""
+    power = np.array(weights or (1.0,) * len(wavelengths))
+    seen = luminous_efficiency(np.array(wavelengths)) * power
+    return tuple(seen.tolist()), float(K_M * seen.sum() / power.sum()) if power.any() else 0.0
 
 
 def measure_of(spectrum: Spectrum | str = "equal", detector: str = "eye") -> Measure:

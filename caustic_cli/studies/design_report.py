@@ -18,6 +18,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from caustic_cli.io.files import atomic_file
 from caustic_cli.io.picture import SOFTWARE, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
+from caustic_cli.studies.irradiance import in_units
 from caustic_cli.studies.radius import cost_of_radius
 from caustic_cli.studies.report import COLOURS, plain_ticks
 
@@ -375,9 +376,9 @@ def _balance_words(figures: dict) -> str:
 
 def _irradiance_words(figures: dict, prefix: str) -> str:
     """Label of an irradiance colour bar: quantity, unit, and peak and mean of the image."""
-    unit = figures["irradiance_unit"].replace("^2", "²")
-    peak, mean = (figures[f"{prefix}{k}_irradiance"] for k in ("peak", "mean"))
-    return f"{'illuminance' if unit == 'lux' else 'irradiance'} ({unit})\npeak {peak:.3g}, mean {mean:.3g}"
+    (name, unit, peak, mean), *others = in_units(figures, prefix)
+    words = f"{name} ({unit})\npeak {peak:.3g}, mean {mean:.3g}"
+    return "".join([words, *(f"; {peak:.3g}, {mean:.3g} {unit}" for _, unit, peak, mean in others)]).replace("^2", "²")
 
 
 def _without_paraboloid(heights: np.ndarray, rx: float, ry: float) -> np.ndarray:

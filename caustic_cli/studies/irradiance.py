@@ -17,6 +17,8 @@ from caustic_cli.scene import Scene, Screen
 
 #: Unit of power -> unit of E, and conversion factor from the unit of power per mm^2.
 UNITS = {"W": ("W/mm^2", 1.0), "lm": ("lux", 1e6)}
+#: Unit of power -> name of E.
+QUANTITIES = {"W": "irradiance", "lm": "illuminance"}
 
 
 def irradiance(image: np.ndarray, screen: Screen) -> np.ndarray:
@@ -42,10 +44,24 @@ def irradiance_figures(scene: Scene, image) -> dict[str, float]:
 
 
 def unit_figures(scene: Scene) -> dict[str, float | str]:
-    """Figures power, of the source, power_unit, and irradiance_unit; fractions_of, what that power is."""
-    unit, pupil = scene.light.unit, scene.pupil
-    words = scene.source.power_words(pupil)
-    return {"power": scene.source.power, "power_unit": unit, "irradiance_unit": UNITS[unit][0], "fractions_of": words}
+    """Figures power, of the source, power_unit, and irradiance_unit; fractions_of, what that power is; and, of a source whose
+    spectrum is known, radiant_flux, W, luminous_flux, lm, and luminous_efficacy, lm/W."""
+    unit, power, each = scene.light.unit, scene.source.power, scene.light.efficacy
+    found = {"power": power, "power_unit": unit, "irradiance_unit": UNITS[unit][0]}
+    found["fractions_of"] = scene.source.power_words(scene.pupil)
+    if not each:
+        return found
+    radiant = power if unit == "W" else power / each
+    return found | {"radiant_flux": radiant, "luminous_flux": radiant * each, "luminous_efficacy": each}
+
+
+def in_units(figures: dict, prefix: str = "") -> list[tuple[str, str, float, float]]:
+    """Quantity, unit, peak and mean of E on the screen; and those of the other quantity, of a source whose spectrum is known."""
+    own = figures["power_unit"]
+    flux = {"W": figures.get("radiant_flux"), "lm": figures.get("luminous_flux")} | {own: figures["power"]}
+    peak, mean = (figures[f"{prefix}{name}_irradiance"] / (flux[own] * UNITS[own][1] or 1.0) for name in ("peak", "mean"))
+    scales = {name: (flux[name] or 0.0) * UNITS[name][1] for name in sorted(UNITS, key=lambda name: name != own)}
+    return [(QUANTITIES[k], UNITS[k][0], peak * scale, mean * scale) for k, scale in scales.items() if k == own or scale]
 
 
 def source_figures(scene: Scene, on_target: float | None) -> dict[str, float | str | None]:

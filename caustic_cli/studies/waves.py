@@ -43,7 +43,8 @@ def wave_figures(
 
     Returns:
         the image, None if it is not available and `required` is false; and wave_relative_rms, wave_psnr_db, wave_ssim,
-        wave_on_target, wave_in_black (None without a target), wave_on_screen, wave_wavelengths (nm), resolvable, the number of
+        wave_on_target, wave_in_black (None without a target), wave_on_screen, wave_wavelengths (nm), wave_spectrum and
+        wave_detector, of the continuous spectrum that these represent, None for spectral lines, resolvable, the number of
         resolvable details across the picture, wave_source_points, the points that the source was taken as, wave_source_error, by
         how much an extended source's light is misplaced so, mm, and wave_peak_irradiance and wave_mean_irradiance, as of a ray
         image.
@@ -61,11 +62,13 @@ def wave_figures(
                 "wave_mean_irradiance",
             )
         ) | {"wave_wavelengths": [], "resolvable": seen.resolvable, "no_wave_image": str(error)}
-    of = _judged(found, target)
+    of, whole = _judged(found, target), scene.light.continuum
     absolute = {f"wave_{name}": value for name, value in irradiance_figures(scene, found.image).items()}
     return found, {
         **{f"wave_{name}": of[name] for name in _SAME},
         "wave_wavelengths": list(found.wavelengths),
+        "wave_spectrum": None if whole is None else whole.spectrum.name,
+        "wave_detector": None if whole is None else whole.detector,
         "resolvable": seen.resolvable,
         "wave_source_points": found.points,
         "wave_source_error": found.spread_error,

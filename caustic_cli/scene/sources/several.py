@@ -167,7 +167,10 @@ def light_of(table: Table, unit: str, color: bool = False) -> Light:
     name, detector = table.get("spectrum"), table.get("detector")
     if name is None and wavelengths:
         by_eye = not color and (detector or ("power" if unit == "W" else "eye")) == "eye"
-        return Light(None, wavelengths, spectra.luminous(wavelengths, weights) if by_eye else weights, color=color, unit=unit)
+        seen, efficacy = spectra.luminous(wavelengths, weights)
+        if by_eye and not efficacy > 0:
+            raise InputError("⟨source.wavelengths⟩: the eye sees none of them; ⟨+source.detector⟩ power measures their power")
+        return Light(None, wavelengths, seen if by_eye else weights, color=color, unit=unit, efficacy=efficacy)
     if name is None and detector is None:
         return Light(unit=unit)
     if weights:
@@ -176,7 +179,7 @@ def light_of(table: Table, unit: str, color: bool = False) -> Light:
     if name is None:
         return Light(unit=unit, measure=measure)
     given, parts = Light(measure=measure).lines(wavelengths) if wavelengths else measure.rule(RAY_NODES)
-    return Light(None, given, parts, unit=unit, measure=measure)
+    return Light(None, given, parts, unit=unit, measure=measure, efficacy=spectra.luminous_efficacy(measure.spectrum))
 
 
 def light_of_all(section: Table, color: bool = False) -> Light:
@@ -187,4 +190,13 @@ def light_of_all(section: Table, color: bool = False) -> Light:
     powers = [table["power"] for table in (section, *section["also"])]
     wavelengths = tuple(w for light in lights for w in light.wavelengths)
     weights = tuple(power * fraction for power, light in zip(powers, lights, strict=True) for fraction in light.fractions)
-    return replace(lights[0], wavelengths=wavelengths, weights=weights)
+    each = [light.efficacy for light in lights if light.efficacy]
+    whole = _together(powers, each, lights[0].unit) if len(each) == len(lights) else None
+    return replace(lights[0], wavelengths=wavelengths, weights=weights, efficacy=whole)
+
+
+def _together(powers: list[float], efficacies: list[float], unit: str) -> float:
+    """Luminous efficacy, lm/W, of sources of given powers, in W or lm, and efficacies."""
+    if unit == "W":
+        return math.fsum(p * e for p, e in zip(powers, efficacies, strict=True)) / math.fsum(powers)
+    return math.fsum(powers) / math.fsum(p / e for p, e in zip(powers, efficacies, strict=True))
