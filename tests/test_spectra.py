@@ -227,11 +227,16 @@ def test_any_spectrum_has_a_rule(rows, n, detector):
     steps, power = zip(*rows, strict=True)
     power = np.array(power)
     power[1] = 1.0
-    measure = Measure(Spectrum("any", 381.0 + np.cumsum(steps) - steps[0], power), detector)
+    measure = Measure(Spectrum("any", 405.0 + np.cumsum(steps) - steps[0], power), detector)
     nodes, weights = measure.nodes(n)
     assert 1 <= len(nodes) <= n and (np.diff(nodes) > 0).all() and (weights > 0).all()
     low, high = measure.range
-    assert low <= nodes[0] and nodes[-1] <= high and low >= 380 and high <= 780
+    assert (
+        low <= nodes[0]
+        and nodes[-1] <= high
+        and low >= (400 if detector == "eye" else 380)
+        and high <= (700 if detector == "eye" else 780)
+    )
     assert weights @ nodes == pytest.approx(measure.mean, rel=1e-9)
     if len(nodes) == n:  # without those of no weight the rest are not exact to the last digit
         np.testing.assert_allclose(measure.weights_at(nodes), weights, atol=1e-7)
@@ -243,7 +248,7 @@ def test_power_is_of_visible_light_unless_there_is_none():
     assert Measure(built_in("sun"), "power").range == (380.0, 780.0)
     infrared = Spectrum("850 nm", np.array([750.0, 800.0, 850.0, 900.0]), np.array([0.0, 0.01, 1.0, 0.0]))
     assert Measure(infrared, "power").range == (750.0, 900.0)
-    with pytest.raises(InputError, match="850 nm: has no power that the eye sees, 380 to 780 nm"):
+    with pytest.raises(InputError, match="850 nm: has no power that the eye sees, 400 to 700 nm"):
         Measure(Spectrum("850 nm", np.array([800.0, 900.0]), np.ones(2)))
     with pytest.raises(InputError, match="no visible light"):
         white_point(Spectrum("1 um", np.array([950.0, 1050.0]), np.ones(2)))

@@ -37,7 +37,10 @@ _SECOND = (("second.file", "second.collimate", "second.focus"), ("second.collima
 #: {feature} the feature.
 EXCLUDED: dict[str, dict[str, str]] = {
     "target.sheet": {"target.color": _SHEET},
-    "target.color": {"source.also": "[[source]] of a coloured picture must be one, whose three wavelengths are its colours"},
+    "target.color": {
+        "source.also": "[[source]] of a coloured picture must be one, whose three wavelengths are its colours",
+        "source.spectrum": "⟨source.spectrum⟩ is not for a coloured picture, whose three wavelengths are its colours",
+    },
     **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
     "element": {
         **dict.fromkeys(TRAITS["two sides"].settings, "⟨{path}⟩" + NOT_BESIDE),
