@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 from oracle import colour_science
@@ -20,6 +19,7 @@ from caustic_cli.scene.spectrum import (
     DETECTORS,
     MOST_NODES,
     MOST_ROWS,
+    TAIL,
     Measure,
     Spectrum,
     built_in,
@@ -131,85 +131,16 @@ def fine(measure: Measure, points: int = 400_001) -> tuple[np.ndarray, np.ndarra
 
 @pytest.mark.parametrize("detector", DETECTORS)
 @pytest.mark.parametrize("name", BUILT_IN)
-def test_gauss_rules_integrate_polynomials(name, detector):
-    """All Chebyshev polynomials of degree 2 n - 1 at most, for which a degree too many is off."""
-    measure = Measure(built_in(name), detector)
-    x, w = fine(measure)
-    low, high = measure.range
-    for n in (1, 2, 3, 5, 9, 21):
-        nodes, weights = measure.nodes(n)
-        assert nodes.shape == weights.shape == (n,)
-        assert (np.diff(nodes) > 0).all() and low < nodes[0] and nodes[-1] < high
-        assert (weights > 0).all() and weights.sum() == pytest.approx(1.0, abs=1e-14)
-
-        def off(degree, nodes=nodes, weights=weights):
-            t, u = (2.0 * (v - low) / (high - low) - 1.0 for v in (nodes, x))
-            return abs(weights @ np.cos(degree * np.arccos(t)) - w @ np.cos(degree * np.arccos(u)))
-
-        assert max(off(degree) for degree in (range(2 * n) if n < 9 else (0, 1, n, 2 * n - 2, 2 * n - 1))) < 2e-7
-        if n <= 5:
-            assert off(2 * n) > 1e-5
-
-
-@pytest.mark.parametrize("name", BUILT_IN)
-def test_many_nodes_remain_exact(name):
-    """61: degree 121 to the accuracy of an independent sum; the modified moments of one rule are those of another."""
-    measure = Measure(built_in(name))
-    x, w = fine(measure)
-    low, high = measure.range
-    for n in (61, MOST_NODES):
-        nodes, weights = measure.nodes(n)
-        assert (np.diff(nodes) > 0).all() and low <= nodes[0] and nodes[-1] <= high and (weights > 0).all()
-        degrees = np.arange(2 * len(nodes))[:, None]
-        t, u = (2.0 * (v - low) / (high - low) - 1.0 for v in (nodes, x[::8]))
-        sums = np.cos(degrees * np.arccos(t)) @ weights
-        some = np.array([0, 1, 60, 120, 121])
-        np.testing.assert_allclose(sums[some], np.cos(degrees[some] * np.arccos(u)) @ (w[::8] / w[::8].sum()), atol=1e-6, rtol=0)
-
-
-def test_five_nodes_by_another_method():
-    """The generalised eigenvalue problem of the Hankel matrices of moments."""
-    measure = Measure(built_in("equal"))
-    x, w = fine(measure)
-    t = (x - 580.0) / 200.0
-    moments = [float(w @ t**k) for k in range(10)]
-    shifted, hankel = (np.array([[moments[i + j + k] for j in range(5)] for i in range(5)]) for k in (1, 0))
-    expected = 580.0 + 200.0 * scipy.linalg.eigvalsh(shifted, hankel)
-    np.testing.assert_allclose(measure.nodes(5)[0], expected, atol=1e-3)
-
-
-def test_a_constant_density_gives_the_rule_of_legendre():
-    nodes, weights = Measure(built_in("equal"), "power").nodes(9)
-    x, w = np.polynomial.legendre.leggauss(9)
-    np.testing.assert_allclose(nodes, 580.0 + 200.0 * x, rtol=1e-12)
-    np.testing.assert_allclose(weights, 0.5 * w, rtol=1e-10)
-
-
-@pytest.mark.parametrize("detector", DETECTORS)
-@pytest.mark.parametrize("name", BUILT_IN)
 def test_mean_and_spread(name, detector):
     measure = Measure(built_in(name), detector)
     x, w = fine(measure)
     assert measure.mean == pytest.approx(w @ x, abs=1e-3)
     assert measure.spread == pytest.approx(np.sqrt(w @ (x - w @ x) ** 2), abs=1e-3)
-    nodes, weights = measure.nodes(2)
-    assert weights @ nodes == pytest.approx(measure.mean, abs=1e-9)
-    assert np.sqrt(weights @ (nodes - measure.mean) ** 2) == pytest.approx(measure.spread, abs=1e-9)
+    nodes, weights = measure.nodes(24)
+    assert weights @ nodes == pytest.approx(measure.mean, abs=1.0)
+    assert np.sqrt(weights @ (nodes - measure.mean) ** 2) == pytest.approx(measure.spread, abs=1.5)
     assert measure.density(x).mean() * (measure.range[1] - measure.range[0]) == pytest.approx(1.0, abs=1e-6)
     assert not measure.density(np.array([100.0, 379.0, 781.0, 5000.0])).any()
-
-
-def test_two_lines_have_two_nodes():
-    nodes, weights = Measure(two_lines(1e-9), "power").nodes(9)
-    np.testing.assert_allclose(nodes, [450.0, 620.0], atol=1e-8)
-    np.testing.assert_allclose(weights, [1 / 3, 2 / 3], atol=1e-9)
-    wide, shares = Measure(two_lines(5.0), "power").nodes(2)
-    np.testing.assert_allclose(wide, [450.0, 620.0], atol=0.2)
-    assert 0.3 < shares[0] < 0.35
-    assert len(Measure(two_lines(5.0), "power").nodes(8)[0]) == 8
-    for n in (3, 5, 61):
-        nodes, weights = Measure(two_lines(1e-3), "eye").nodes(n)
-        assert 2 <= len(nodes) <= n and (np.diff(nodes) > 0).all() and weights.min() > 1e-12
 
 
 def test_a_laser_is_one_wavelength():
@@ -231,17 +162,28 @@ def test_any_spectrum_has_a_rule(rows, n, detector):
     nodes, weights = measure.nodes(n)
     assert 1 <= len(nodes) <= n and (np.diff(nodes) > 0).all() and (weights > 0).all()
     low, high = measure.range
-    assert (
-        low <= nodes[0]
-        and nodes[-1] <= high
-        and low >= (400 if detector == "eye" else 380)
-        and high <= (700 if detector == "eye" else 780)
-    )
-    assert weights @ nodes == pytest.approx(measure.mean, rel=1e-9)
-    if len(nodes) == n:  # without those of no weight the rest are not exact to the last digit
-        np.testing.assert_allclose(measure.weights_at(nodes), weights, atol=1e-7)
-    if n > 1 and len(nodes) > 1:
-        assert weights @ (nodes - measure.mean) ** 2 == pytest.approx(measure.spread**2, rel=1e-6, abs=1e-9)
+    least, most = (400.0, 700.0) if detector == "eye" else (380.0, 780.0)
+    assert least <= low <= nodes[0] and nodes[-1] <= high <= most and weights.sum() == pytest.approx(1.0)
+    np.testing.assert_array_equal(measure.weights_at(nodes), weights)
+
+
+@pytest.mark.parametrize("n", [2, 5, 9])
+def test_nodes_of_a_constant_density_are_the_middles_of_equal_parts(n):
+    nodes, weights = Measure(built_in("equal"), "power").nodes(n)
+    low, high = 380.0 + 400.0 * TAIL, 780.0 - 400.0 * TAIL
+    middles = low + (high - low) * (np.arange(n) + 0.5) / n
+    np.testing.assert_allclose(nodes[1:-1], middles[1:-1], atol=0.3)
+    assert 380.0 < nodes[0] < middles[0] and middles[-1] < nodes[-1] < 780.0  # they take the tails, too
+    np.testing.assert_allclose(weights, 1.0 / n, atol=0.01)
+
+
+def test_two_lines_have_two_nodes():
+    for width in (1e-9, 1e-3, 5.0):
+        for n in (2, 9, 61):
+            nodes, weights = Measure(two_lines(width), "power").nodes(n)
+            assert (np.abs(nodes[:, None] - [450.0, 620.0]).min(1) <= width).all()
+            assert weights[nodes < 535.0].sum() == pytest.approx(1 / 3, abs=0.01)
+    assert len(Measure(two_lines(1e-9), "power").nodes(9)[0]) == 2
 
 
 def test_power_is_of_visible_light_unless_there_is_none():
@@ -259,28 +201,9 @@ def test_power_is_of_visible_light_unless_there_is_none():
 # weights of given wavelengths
 
 
-@pytest.mark.parametrize("detector", DETECTORS)
-@pytest.mark.parametrize("name", BUILT_IN)
-def test_weights_at_gauss_nodes_are_theirs(name, detector):
-    measure = Measure(built_in(name), detector)
-    for n in (1, 2, 5, 9, 61):
-        nodes, weights = measure.nodes(n)
-        np.testing.assert_allclose(measure.weights_at(nodes), weights, atol=1e-12)
-
-
-def test_interpolatory_weights_are_exact():
-    measure = Measure(built_in("led-4000"))
-    x, w = fine(measure)
-    at = np.array([460.0, 530.0, 590.0, 650.0])
-    weights = measure.weights_at(at)
-    assert (weights > 0).all()
-    for degree in range(4):
-        assert weights @ ((at - 560.0) / 100.0) ** degree == pytest.approx(w @ ((x - 560.0) / 100.0) ** degree, abs=1e-6)
-
-
 @pytest.mark.parametrize("at", [np.linspace(385.0, 775.0, 40), np.array([400.0, 410.0, 700.0]), np.linspace(300.0, 900.0, 500)])
 @pytest.mark.parametrize("detector", DETECTORS)
-def test_cells_where_interpolation_has_negative_weights(at, detector):
+def test_weights_are_those_of_the_nearest_wavelength(at, detector):
     measure = Measure(built_in("led-3000"), detector)
     x, w = fine(measure)
     weights = measure.weights_at(at)

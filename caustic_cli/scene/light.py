@@ -23,7 +23,7 @@ RGB = (611.4, 549.1, 464.3)
 #: Largest number of wavelengths of one source: each takes a trace.
 MAX_WAVELENGTHS = 99
 #: Wavelengths that represent a continuous spectrum: as traced through a dispersive glass, and in the verdict on a wave image.
-RAY_NODES, WAVE_NODES = 5, 7
+RAY_NODES, WAVE_NODES = 5, 9
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,8 @@ class Light:
     def lines(self, wavelengths: tuple[float, ...] = ()) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Wavelengths of its wave image, nm, and the fraction of the light that each represents.
 
-        wavelengths: those to take instead of its own lines, of equal power, or of a Gauss rule of its continuous spectrum, each for
-        its share of that.
+        wavelengths: those to take instead: of its own lines, with equal powers, or of those that represent its continuous spectrum,
+        each for its share of that.
         """
         if (whole := self.continuum) is None:
             return (

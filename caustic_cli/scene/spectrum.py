@@ -5,13 +5,13 @@ Notation
     S(lambda)  spectral power per nm, relative; linear between the wavelengths of a table, 0 outside
     V(lambda)  luminous efficiency of the photopic eye, the second of the colour-matching functions
     w(lambda)  density of a measure, S V for the eye and S for a meter of power, with the integral 1
-    p_k        polynomials orthonormal under w, with recurrence coefficients alpha_k, beta_k
 
 The tables beside this module are those of CIE 15:2018, ISO/CIE 11664-1 and 11664-2, and ASTM G173-03; the first line of each names
-its source.  A Gauss rule of n nodes integrates the product of w and any polynomial in lambda of degree 2 n - 1 exactly: what a
-dispersive lens does to a picture is smooth in lambda, and few wavelengths represent a whole spectrum.  Its recurrence is found by
-the Lanczos process with reorthogonalisation on a fine discretisation of w, its nodes as eigenvalues of the Jacobi matrix (Golub and
-Welsch, Math. Comp. 23, 221 (1969); Gautschi, Orthogonal Polynomials, Oxford 2004, section 2.2).
+its source.
+
+A wave image varies with the wavelength like a band-limited function, with a correlation length of some tens of nanometres: equally
+spaced wavelengths resolve it with the fewest.  Of the default flame by an eye, 7 of them give the error of 46 within 0.2 %, where a
+Gauss rule, whose nodes crowd where there is little light, needs 17 for 1 %.
 """
 
 from __future__ import annotations
@@ -50,14 +50,16 @@ MOST_ROWS = 10_000
 WAVELENGTHS = (100.0, 20_000.0)
 #: Share of the power in visible light below which a spectrum counts as invisible.
 INVISIBLE = 0.01
-#: Most nodes of a rule, and most wavelengths for which interpolatory weights are tried.
+#: Most wavelengths of a rule.
 MOST_NODES = 128
+#: Share of the light at either end of a spectrum that takes no wavelength of its own.
+TAIL = 0.01
+#: Least width of a range, nm.
+TINY = 1e-9
 #: Intervals of the discretisation over the whole range, at least, and Gauss-Legendre points of each.
 INTERVALS, POINTS = 400, 8
-#: beta_k at which the recurrence ends, nm: more nodes would resolve only the width of lines as narrow as that.
-LEAST_BETA = 1e-6
-#: Weight, of either sign, that counts as 0, and error of an integral that counts as none.
-ROUNDING, EXACT = 1e-12, 1e-9
+#: Share of the light that counts as none.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,22 +215,23 @@ class Measure:
         return np.where((wavelengths >= low) & (wavelengths <= high), self._measured(wavelengths) / self._total, 0.0)
 
     def nodes(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss rule of n nodes: wavelengths (n,) nm, ascending and within `range`, and weights (n,), positive with the sum 1.
+        """n wavelengths, nm, ascending, that represent the spectrum, and their weights, as of `weights_at`.
 
-        Fewer where the density carries no more, as that of two lines narrower than LEAST_BETA, and without nodes of no weight.  A
-        node between two lines, where the density is 0, has a small weight.
+        They are the mean wavelengths of n equal parts of the range that has all but TAIL of the light at either end; fewer where a
+        part is dark.
 
         Raises:
             InputError: n is not 1 to MOST_NODES.
         """
         if not 1 <= n <= MOST_NODES:
             raise InputError(f"the number of wavelengths must be 1 to {MOST_NODES}, got {n}")
-        alpha, beta = self._recurrence(n)
-        t = np.linalg.eigvalsh(np.diag(alpha) + np.diag(beta[:-1], 1) + np.diag(beta[:-1], -1))
-        weights = 1.0 / (_polynomials(alpha, beta, t) ** 2).sum(0)  # Christoffel numbers: accurate also where they are small
-        kept = weights > ROUNDING
-        low, high = self.range
-        return np.clip(0.5 * (low + high) + 0.5 * (high - low) * t[kept], low, high), weights[kept] / weights[kept].sum()
+        x, weights = self._points
+        sums = np.cumsum(weights)
+        low, high = x[np.searchsorted(sums, (TAIL, 1.0 - TAIL))]
+        part = np.clip((x - low) / max(high - low, TINY) * n, 0, n - 1).astype(int)
+        whole = np.bincount(part, weights, n)
+        at = np.bincount(part, weights * x, n)[whole > ROUNDING] / whole[whole > ROUNDING]
+        return at, self.weights_at(at)
 
     def rule(self, n: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """`nodes` as numbers."""
@@ -236,10 +239,7 @@ class Measure:
         return tuple(wavelengths.tolist()), tuple(weights.tolist())
 
     def weights_at(self, wavelengths: np.ndarray) -> np.ndarray:
-        """Weights (n,) of given wavelengths (n,) nm, ascending, none negative and with the sum 1.
-
-        They are those of the interpolatory rule, exact for polynomials of degree n - 1 and equal to those of the Gauss rule at its
-        nodes, unless one is negative: then the integrals of w over the cells of wavelengths nearest to each.
+        """Weights (n,) of given wavelengths (n,) nm, ascending: the share of the light whose nearest wavelength each is.
 
         Raises:
             InputError: the wavelengths do not ascend.
@@ -247,33 +247,8 @@ class Measure:
         at = np.asarray(wavelengths, dtype=np.float64)
         if at.ndim != 1 or not len(at) or not np.isfinite(at).all() or not (np.diff(at) > 0).all():
             raise InputError("wavelengths must be finite and ascend")
-        weights = self._interpolatory(at) if len(at) <= MOST_NODES else None
-        if weights is None or weights.min() < -ROUNDING:
-            weights = np.diff(self._cumulative(0.5 * (at[1:] + at[:-1])), prepend=0.0, append=1.0)
-        weights = np.maximum(weights, 0.0)
+        weights = np.maximum(np.diff(self._cumulative(0.5 * (at[1:] + at[:-1])), prepend=0.0, append=1.0), 0.0)
         return weights / weights.sum()
-
-    def _interpolatory(self, at: np.ndarray) -> np.ndarray | None:
-        """The weights whose sums with all p_k, k < n, are the integrals with w, that is 1 for p_0 and else 0.
-
-        The matrix of the p_k is orthogonal at Gauss nodes once its columns are scaled.  None where it is singular to rounding, or
-        the density carries fewer nodes.
-        """
-        alpha, beta = self._recurrence(len(at))
-        if len(alpha) < len(at):
-            return None
-        low, high = self.range
-        with np.errstate(over="ignore", invalid="ignore"):
-            values = _polynomials(alpha, beta, (at - 0.5 * (low + high)) / (0.5 * (high - low)))
-            scale = np.linalg.norm(values, axis=0)
-        if not np.isfinite(scale).all():
-            return None
-        wanted = np.eye(len(at))[0]
-        try:
-            weights = np.linalg.solve(values / scale, wanted) / scale
-        except np.linalg.LinAlgError:
-            return None
-        return weights if np.abs(values @ weights - wanted).max() < EXACT else None
 
     def _cumulative(self, at: np.ndarray) -> np.ndarray:
         """Integral of w up to wavelengths, exact."""
@@ -318,27 +293,6 @@ class Measure:
         weights = weights * self._measured(x)
         return x[weights > 0], weights[weights > 0] / weights.sum()
 
-    def _recurrence(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """alpha_k and beta_k, k < m <= n, (m,) each, of wavelengths that are scaled to -1 to 1 over `range`."""
-        x, weights = self._points
-        low, high = self.range
-        least = LEAST_BETA / (0.5 * (high - low))
-        t = (x - 0.5 * (low + high)) / (0.5 * (high - low))
-        basis = np.empty((n, len(t)))
-        vector = np.sqrt(weights)
-        alpha, beta = [], []
-        for k in range(n):
-            basis[k] = vector
-            alpha.append(float(vector @ (t * vector)))
-            vector = t * vector
-            for _ in range(2):  # orthogonal to working precision
-                vector = vector - basis[: k + 1].T @ (basis[: k + 1] @ vector)
-            beta.append(float(np.linalg.norm(vector)))
-            if beta[-1] < least:
-                break
-            vector = vector / beta[-1]
-        return np.array(alpha), np.array(beta)
-
 
 def luminous(wavelengths: tuple[float, ...], weights: tuple[float, ...] = ()) -> tuple[tuple[float, ...], float]:
     """Relative luminous flux (n,) of spectral lines (n,) nm with relative powers (n,), equal where none are given, and the luminous
@@ -365,14 +319,6 @@ def _built_in_measure(name: str, detector: str) -> Measure:
     if (found.name, detector) == ("equal", "power"):
         found = Spectrum(found.name, np.array(BAND), np.ones(2))
     return Measure(found, detector)
-
-
-def _polynomials(alpha: np.ndarray, beta: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """p_k (m, n) at scaled wavelengths (n,), k < m by the recurrence (m,): t p_k = beta_k p_k+1 + alpha_k p_k + beta_k-1 p_k-1."""
-    p = [np.ones_like(t)]
-    for k in range(len(alpha) - 1):
-        p.append(((t - alpha[k]) * p[k] - (beta[k - 1] * p[k - 1] if k else 0.0)) / beta[k])
-    return np.array(p)
 
 
 def _knots(spectrum: Spectrum, low: float, high: float) -> np.ndarray:
