@@ -28,8 +28,10 @@ from rich.progress import (
 from rich.text import Text
 
 from caustic_cli.errors import LISTS, MARK, InputError, plain_name, shortened
+from caustic_cli.loading import OnDemand
 from caustic_cli.schema.table import TABLE
-from caustic_cli.studies.irradiance import in_units
+
+irradiance = OnDemand("caustic_cli.studies.irradiance")
 
 #: Seconds between lines of --progress json.
 LINE_EVERY = 0.5
@@ -326,7 +328,10 @@ def _of_image(figures: dict, prefix: str) -> list[tuple[str, str]]:
         noise = "" if prefix else _noise(figures, "in_black_noise", ".2%")
         rows.append(("light in black", _number(figures, f"{prefix}in_black", ".2%") + noise))
     if figures.get(f"{prefix}peak_irradiance") is not None:
-        rows += [(name, f"peak {peak:.4g} {unit}, mean {mean:.4g} {unit}") for name, unit, peak, mean in in_units(figures, prefix)]
+        rows += [
+            (name, f"peak {peak:.4g} {unit}, mean {mean:.4g} {unit}")
+            for name, unit, peak, mean in irradiance.in_units(figures, prefix)
+        ]
     if figures.get("luminous_flux"):
         each = f"{figures['luminous_efficacy']:.4g} lm/W"
         rows.append(("power of the source", f"{figures['radiant_flux']:.4g} W, {figures['luminous_flux']:.4g} lm ({each})"))

@@ -57,11 +57,14 @@ def unit_figures(scene: Scene) -> dict[str, float | str]:
 
 def in_units(figures: dict, prefix: str = "") -> list[tuple[str, str, float, float]]:
     """Quantity, unit, peak and mean of E on the screen; and those of the other quantity, of a source whose spectrum is known."""
-    own = figures["power_unit"]
-    flux = {"W": figures.get("radiant_flux"), "lm": figures.get("luminous_flux")} | {own: figures["power"]}
-    peak, mean = (figures[f"{prefix}{name}_irradiance"] / (flux[own] * UNITS[own][1] or 1.0) for name in ("peak", "mean"))
-    scales = {name: (flux[name] or 0.0) * UNITS[name][1] for name in sorted(UNITS, key=lambda name: name != own)}
-    return [(QUANTITIES[k], UNITS[k][0], peak * scale, mean * scale) for k, scale in scales.items() if k == own or scale]
+    peak, mean = (figures[f"{prefix}{name}_irradiance"] for name in ("peak", "mean"))
+    own = next(key for key, (name, _) in UNITS.items() if name == figures["irradiance_unit"])
+    found = [(QUANTITIES[own], UNITS[own][0], peak, mean)]
+    if each := figures.get("luminous_efficacy"):
+        (other,) = UNITS.keys() - {own}
+        scale = UNITS[other][1] / UNITS[own][1] * (each if own == "W" else 1.0 / each)
+        found.append((QUANTITIES[other], UNITS[other][0], scale * peak, scale * mean))
+    return found
 
 
 def source_figures(scene: Scene, on_target: float | None) -> dict[str, float | str | None]:

@@ -166,20 +166,21 @@ def light_of(table: Table, unit: str, color: bool = False) -> Light:
     wavelengths, weights = (tuple(table.get(key, ())) for key in ("wavelengths", "weights"))
     name, detector = table.get("spectrum"), table.get("detector")
     if name is None and wavelengths:
+        given = Light(None, wavelengths, weights, color=color, unit=unit)
         by_eye = not color and (detector or ("power" if unit == "W" else "eye")) == "eye"
         seen, efficacy = spectra.luminous(wavelengths, weights)
         if by_eye and not efficacy > 0:
             raise InputError("⟨source.wavelengths⟩: the eye sees none of them; ⟨+source.detector⟩ power measures their power")
-        return Light(None, wavelengths, seen if by_eye else weights, color=color, unit=unit, efficacy=efficacy)
+        return replace(given, weights=seen if by_eye else weights, efficacy=efficacy)
     if name is None and detector is None:
-        return Light(unit=unit)
+        return Light(None, wavelengths, weights, unit=unit)
     if weights:
         raise InputError("⟨source.weights⟩ follow from ⟨source.spectrum⟩: give one of them")
     measure = spectra.measure_of(content(table, "spectrum", spectra.Spectrum) or name or "equal", detector or "eye")
     if name is None:
         return Light(unit=unit, measure=measure)
-    given, parts = Light(measure=measure).lines(wavelengths) if wavelengths else measure.rule(RAY_NODES)
-    return Light(None, given, parts, unit=unit, measure=measure, efficacy=spectra.luminous_efficacy(measure.spectrum))
+    at, parts = Light(measure=measure).lines(wavelengths) if wavelengths else measure.rule(RAY_NODES)
+    return Light(None, at, parts, unit=unit, measure=measure, efficacy=spectra.luminous_efficacy(measure.spectrum))
 
 
 def light_of_all(section: Table, color: bool = False) -> Light:
