@@ -18,6 +18,7 @@ from rayfiles import cone_of, tm25
 
 from caustic_cli import cli, load
 from caustic_cli.export.page import MOST, PAGE, _coded, _onto, write_page
+from caustic_cli.io.colorimetry import _into_gamut, rgb_matrix
 from caustic_cli.io.files import is_ours
 from caustic_cli.scene import Screen
 from caustic_cli.studies.metrics import relative_rms
@@ -194,3 +195,45 @@ def test_rays_of_a_file_are_refused(home, monkeypatch, capfd):
     assert PAGE.supports(scene)
     rays = replace(scene, source=SimpleNamespace(rays=1, members=(1,), nearest=-60.0))
     assert "plane waves, points, grids and discs" in PAGE.why_not(rays)
+
+
+def test_light_with_a_spectrum_is_in_colour(tmp_path, monkeypatch):
+    """Every index has its colour, and all together are the white of the source; the wave image is that of wave.png."""
+    monkeypatch.chdir(tmp_path)
+    write_blob()
+    given = ["--resolution", "32", "--control", "19", "--iterations", "1", "--waves", "off", "--threads", "1", "--quiet"]
+    lamp = ["--spectrum", "led-3000", "--glass", "N-SF11", "--lens-size", "2", "--throw", "60", "--mag", "2"]
+    assert cli.run(["design", "blob.png", *given, *lamp, "-o", "lamp"]) == 0
+    command = ["render", "lamp", "--rays", "1e4", "--html", "lamp.html", "--npy", "lamp.npy", "--quiet"]
+    assert cli.run([*command, "--effects", "dispersion,diffraction"]) == 0
+    held = json.loads(re.search(r'id="data">(.*?)</script>', Path("lamp.html").read_text("utf-8"), re.S)[1])
+    (light,) = held["lights"]
+    indices, parts, colours = zip(*light["indices"], strict=True)
+    assert len(set(indices)) == 5 and sum(parts) == pytest.approx(1.0)
+    assert np.array(parts) @ np.array(colours) == pytest.approx((1.0, 1.0, 1.0), abs=1e-6)
+    assert colours[0][2] > max(colours[0][:2]) and colours[-1][0] > max(colours[-1][1:])  # blue, ..., red
+    planes = [part["low"] + part["step"] * unpacked(part) for part in held["wavesColour"]]
+    scene = load("lamp").scene
+    wanted = np.tensordot(rgb_matrix(scene.white), np.load("lamp-wave.npy"), 1)
+    np.testing.assert_allclose(planes, wanted, rtol=0, atol=2e-5 * np.abs(wanted).max())
+
+
+def unpacked(part: dict) -> np.ndarray:
+    """The 16-bit codes of a grid of the page."""
+    count = math.prod(part["shape"])
+    data = np.frombuffer(zlib.decompress(base64.b64decode(part["data"])), np.uint8).astype(np.int64)
+    steps = (data[:count] + 256 * data[count:]).reshape(part["shape"])
+    return np.cumsum(np.cumsum(steps, 0), 1) & 65535
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's functions")
+def test_the_page_keeps_colours_in_the_gamut_as_images_do():
+    script = (Path(cli.__file__).parent / "export/page/page.js").read_text("utf-8")
+    needed = [
+        re.search(pattern, script, re.S | re.M)[0]
+        for pattern in (r"^const LUMINANCE.*?;", r"^const clamped.*?;$", r"^function intoGamut.*?^}")
+    ]
+    colours = np.random.default_rng(0).uniform(-0.5, 2.0, (200, 3))
+    program = "\n".join([*needed, f"console.log(JSON.stringify({colours.tolist()}.map(intoGamut)))"])
+    found = json.loads(subprocess.run(["node", "-e", program], capture_output=True, text=True, check=True).stdout)
+    np.testing.assert_allclose(found, _into_gamut(colours), rtol=0, atol=2e-4)  # the luminances there are of four digits

@@ -78,7 +78,9 @@ class OutputOptions(options.Given):
     npy: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Also write the irradiance: power per pixel as a fraction of the source's, float64, [i, j]."
+            metavar="FILE",
+            help="Also write the irradiance: power per pixel as a fraction of the source's, float64, [i, j]; of light with a"
+            " spectrum seen by the eye X, Y and Z on that scale, (3, n_x, n_y).",
         ),
     ] = None
     html: Annotated[

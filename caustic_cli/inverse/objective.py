@@ -48,7 +48,7 @@ CHUNK_OF_ROWS, KEPT_OF_ROWS = 1 << 24, 1 << 25
 @dataclass(frozen=True)
 class Evaluation:
     """Loss (units of eq. 5.2.1), its gradients with respect to the heights of each surface (n, m) per mm, the fraction of the light
-    on the screen, and the image there, power per pixel, (n_x, n_y) or (3, n_x, n_y)."""
+    on the screen, and the image there, power per pixel, (n_x, n_y), or (3, n_x, n_y) for channels or tristimulus values."""
 
     loss: float
     gradients: dict[str, Tensor]

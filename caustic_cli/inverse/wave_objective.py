@@ -23,6 +23,7 @@ from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.objective import Evaluation, penalty_of
 from caustic_cli.inverse.schedule import LossImage
+from caustic_cli.optics.image import with_colour
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves.image import Imager, Line, lines_of
@@ -96,6 +97,7 @@ class WaveObjective:
             self.imager = Imager.of(lines, parameters, receiver, watched=_lit(scene, target), dense=True)
             self.parts = list(self._parts(lines[rank::count], parameters))
         self.fronts = list({id(part.front): part.front for part in self.parts}.values())
+        self.in_colour = lines[0].colour is not None
         self.colours = len({line.channel for line in lines if line.channel is not None})
         n = self.imager.sampling
         self.keeps_graphs = len(self.parts) * (8 * n.samples + 16 * n.count[0] * n.count[1]) <= KEPT
@@ -127,15 +129,18 @@ class WaveObjective:
         shape = (3, *self.loss.target.shape) if self.colours else self.loss.target.shape
         image = torch.zeros(shape, dtype=torch.float64, device=heights.device)
         leaving = image.new_zeros(image.shape[:-2])
+        xyz = image.new_zeros(3, *image.shape) if self.in_colour else image.new_zeros(0)
         by = {id(front): z.detach().to(self.dtype).requires_grad_() for front, z in zip(self.fronts, moved, strict=True)}
         seen = []
         with torch.set_grad_enabled(self.keeps_graphs):
             for part in self.parts:
                 found = self._image(part, by[id(part.front)])
-                self._channel(image, part)[...] += part.line.part * found.detach().double()
+                power = part.line.part * found.detach().double()
+                self._channel(image, part)[...] += power
+                xyz += with_colour(None, power, part.line.colour) if self.in_colour else 0.0
                 self._channel(leaving, part)[...] += part.line.part * part.power
                 seen.append(found if self.keeps_graphs else None)
-        ranks.all_reduce(image, leaving)
+        ranks.all_reduce(image, leaving, xyz)
         image.requires_grad_()
         loss = self.loss(image, leaving, penalty)
         by_image, direct = (
@@ -154,8 +159,10 @@ class WaveObjective:
         if direct is not None:
             gradient = gradient + direct
         a = self.apron
-        inner = image.detach()[..., a : image.shape[-2] - a, a : image.shape[-1] - a]
-        return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()), inner)
+        inner, shown = (
+            c[..., a : image.shape[-2] - a, a : image.shape[-1] - a] for c in (image.detach(), xyz if len(xyz) else image)
+        )
+        return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()), shown.detach())
 
     def _moved(self, front: Wavefront, change: Tensor) -> Tensor:
         """Displacement of the surface at the intersections of the rays of a wavefront, (n, m) mm."""

@@ -191,7 +191,7 @@ def _source(data: Archive, rays: RaySet | None) -> Source:
 def _several(data: Archive, rays: RaySet | None) -> Several:
     """Several sources, of which those that are ray files have these rays."""
     (count,) = data.wholes("source_count", 1)
-    members, spectra, files = [], [], 0
+    members, spectra, measures, files = [], [], [], 0
     for k in range(1, min(count, MOST) + 1):
         with naming(f"source {k}"):
             one = data.renamed({key: f"source_{k}_{key.removeprefix('source_')}" for key in KEYS})
@@ -200,9 +200,10 @@ def _several(data: Archive, rays: RaySet | None) -> Several:
             files += one.text("source_type") == "rays"
             members.append(_source(one, rays if one.text("source_type") == "rays" else None))
             spectra.append(_spectrum(one))
+            measures.append(_measure(one))
     if rays is not None and not files:
         raise InputError("⟨source.file⟩ belongs to an archive whose source is a ray file, and none of this one's is")
-    return Several(tuple(members), tuple(spectra))
+    return Several(tuple(members), tuple(spectra), tuple(measures))
 
 
 def _measured(data: Archive, rays: RaySet | None) -> Measured:

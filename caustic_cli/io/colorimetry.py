@@ -47,6 +47,17 @@ def adaptation(white: Sequence[float] | np.ndarray, to: Sequence[float] | np.nda
     return np.linalg.solve(BRADFORD, (after / before)[:, None] * BRADFORD)
 
 
+def rgb_matrix(white: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Matrix (3, 3) from X, Y, Z under a white (3,) to linear R, G, B of sRGB under its own."""
+    return np.linalg.solve(XYZ_OF_RGB, adaptation(np.asarray(white, dtype=float), D65))
+
+
+def xyz_to_rgb(xyz: np.ndarray, white: Sequence[float] | np.ndarray, exposure: float = 1.0, axis: int = -1) -> np.ndarray:
+    """Linear R, G, B from 0 to 1, of the same shape, in the primaries of sRGB: as of `xyz_to_srgb`, before the encoding."""
+    rgb = np.moveaxis(np.asarray(xyz, dtype=float), axis, -1) @ (exposure * rgb_matrix(white)).T
+    return np.moveaxis(_into_gamut(rgb), -1, axis)
+
+
 def xyz_to_srgb(xyz: np.ndarray, white: Sequence[float] | np.ndarray, exposure: float = 1.0, axis: int = -1) -> np.ndarray:
     """uint8 codes of the same shape: sRGB under its own D65, in which `white` divided by the exposure appears white.
 
@@ -55,10 +66,7 @@ def xyz_to_srgb(xyz: np.ndarray, white: Sequence[float] | np.ndarray, exposure: 
         white: (3,) X, Y, Z of the source's light.
         exposure: factor of the brightness.
     """
-    white = np.asarray(white, dtype=float)
-    matrix = np.linalg.solve(XYZ_OF_RGB, adaptation(white, D65)) * exposure
-    rgb = np.moveaxis(np.asarray(xyz, dtype=float), axis, -1) @ matrix.T
-    return np.moveaxis(np.rint(to_srgb(_into_gamut(rgb)) * 255.0).astype(np.uint8), -1, axis)
+    return np.rint(to_srgb(xyz_to_rgb(xyz, white, exposure, axis)) * 255.0).astype(np.uint8)
 
 
 def srgb_to_xyz(codes: np.ndarray, white: Sequence[float] | np.ndarray = tuple(D65), axis: int = -1) -> np.ndarray:

@@ -20,6 +20,7 @@ from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import evaluation_rays, retrace
+from caustic_cli.studies.viewing import tristimulus_values
 
 by_waves = OnDemand("caustic_cli.studies.waves")
 
@@ -41,8 +42,17 @@ class Evaluated:
     image: np.ndarray
     #: The same by waves, None if that was not refined.
     waves: np.ndarray | None = None
+    #: Tristimulus values of both, (3, n_x, n_y), None for light without colour.
+    xyz: np.ndarray | None = None
+    waves_xyz: np.ndarray | None = None
     #: The image on a screen farther away and its target, (k_x, k_y) each, or None.
     farther: tuple[np.ndarray, np.ndarray] | None = None
+
+    @property
+    def shown(self) -> np.ndarray:
+        """The wave image if there is one, else that by rays; its tristimulus values for light with colour."""
+        image, xyz = (self.image, self.xyz) if self.waves is None else (self.waves, self.waves_xyz)
+        return image if xyz is None else xyz
 
 
 class Seen(NamedTuple):
@@ -138,8 +148,15 @@ class LensEvaluation:
 
     def result(self) -> Evaluated:
         """The result."""
-        light = None if self.light is None else self.light.image.cpu().numpy()
-        return Evaluated(self.state, judged(self.figures, self.refined), self.exposure.image.cpu().numpy(), light)
+        scene, rays, waves = self.problem.scene, self.exposure, self.light
+        return Evaluated(
+            self.state,
+            judged(self.figures, self.refined),
+            rays.image.cpu().numpy(),
+            None if waves is None else waves.image.cpu().numpy(),
+            tristimulus_values(scene, rays),
+            None if waves is None else tristimulus_values(scene, waves),
+        )
 
 
 def radius_figures(radius: float, rounded: dict, unrounded: dict) -> dict[str, float | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+import torch
 from torch import Tensor
 
 #: A tensor while rays are traced, a number for a complete image.
@@ -27,3 +28,15 @@ class Image(Generic[Amount]):
     lost: dict[str, Amount]
     #: Their number.
     rays: int = 0
+    #: (3, n_x, n_y) tristimulus values on the same scale, Y that of the image, where the colour of the light differs from pixel to
+    #: pixel; None elsewhere.
+    xyz: Tensor | None = None
+
+
+def with_colour(total: Tensor | None, image: Tensor, colour: tuple[float, float, float] | None) -> Tensor | None:
+    """Tristimulus values (3, n_x, n_y) so far, None at first, and those of one more image (n_x, n_y), whose light has one colour:
+    X, Y, Z with Y = 1; unchanged without colour."""
+    if colour is None:
+        return total
+    more = torch.tensor(colour, dtype=torch.float64, device=image.device)[:, None, None] * image.detach()
+    return more if total is None else total + more

@@ -34,7 +34,7 @@ from caustic_cli.optics.backends import Fused, backend_for
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Rays, of_member, rays_of
 from caustic_cli.optics.frames import rotate_to_global, rotate_to_local
-from caustic_cli.optics.image import Image
+from caustic_cli.optics.image import Image, with_colour
 from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.interface import OutgoingRays, interact
 from caustic_cli.optics.lowering import covers, lowered
@@ -82,7 +82,10 @@ class Tracer:
         wavelength: float | None = None,
         track: bool = False,
     ):
-        self.system, self.requests, self.weight, self.channel, self.track = system, requests, weight, channel, track
+        self.system, self.requests, self.weight, self.track = system, requests, weight, track
+        self.channel = channel
+        #: As of a `scene.Band`.
+        self.colour: tuple[float, float, float] | None = None
         self.media, self.sides = system.media(), system.sides()
         #: Of gradient-index media: numbers of integration steps by (medium, element, forward), with the parameters they are for.
         self.steps: dict[tuple[int, int, bool], tuple[int, list]] = {} if like is None else dict(like.steps)
@@ -321,6 +324,7 @@ def tracers(
         system, traced = System.of(band.scene, field), None
         for rays in of_member(sampler, band.member).chunks(chunk, *share):
             traced = Tracer(system, rays, dtype, requests, traced, weight=band.weight, channel=band.channel, **options)
+            traced.colour = band.colour
             yield traced
 
 
@@ -423,16 +427,19 @@ def _total(
     """Sums over tracers, without derivatives: an image for each screen, from one trace of the rays."""
     images = [torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes]
     accounts, leaving = [dict.fromkeys(LOSSES, 0.0) for _ in screens], [0.0] * len(images)
+    coloured: list[Tensor | None] = [None] * len(images)
     with torch.no_grad():
         for traced in chunks:
             states = traced(parameters) if len(images) > 1 else None
             for k, screen in enumerate(screens):
                 exposure = traced.expose(parameters, screen, filter) if states is None else traced.collect(states, screen, filter)
                 images[k] += exposure.image
+                coloured[k] = with_colour(coloured[k], exposure.image, traced.colour)
                 leaving[k] += float(exposure.leaving.sum())
                 for name, value in exposure.lost.items():
                     accounts[k][name] += float(value)
-    return [Image(*of, rays) for of in zip(images, leaving, accounts, strict=True)]
+    parts = zip(images, leaving, accounts, coloured, strict=True)
+    return [Image(image, behind, lost, rays, xyz) for image, behind, lost, xyz in parts]
 
 
 def check_clearance(scene: Scene, heights: Tensor, screen: Screen) -> None:

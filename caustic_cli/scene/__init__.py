@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from caustic_cli.errors import InputError
 from caustic_cli.scene import sources
 from caustic_cli.scene.aperture import Aperture, CircularAperture, Pupil
@@ -60,6 +62,8 @@ class Band:
     weight: float = 1.0
     #: Colour channel of the image, None for an image without colours.
     channel: int | None = None
+    #: Tristimulus values of its light, with Y = 1, where the colour of the light differs from band to band.
+    colour: tuple[float, float, float] | None = None
     #: Index of the source among several, None for a single one.
     member: int | None = None
 
@@ -196,11 +200,24 @@ class Scene:
         """One scene for each of its sources, with that source alone."""
         if len(self.source.members) == 1:
             return (self,)
-        spectra = self.source.spectra if self.light.wavelengths else [((), ())] * len(self.source.members)
+        members, count = self.source.members, len(self.source.members)
+        spectra = self.source.spectra if self.light.wavelengths else [((), ())] * count
+        measures = self.source.measures or (self.light.measure,) * count
         return tuple(
-            replace(self, source=member, light=replace(self.light, wavelengths=wavelengths, weights=weights))
-            for member, (wavelengths, weights) in zip(self.source.members, spectra, strict=True)
+            replace(self, source=member, light=replace(self.light, wavelengths=wavelengths, weights=weights, measure=measure))
+            for member, (wavelengths, weights), measure in zip(members, spectra, measures, strict=True)
         )
+
+    @cached_property
+    def white(self) -> tuple[float, float, float] | None:
+        """Tristimulus values X, Y, Z, with Y = 1, of the light of all its sources on a white screen; None where that of one has no
+        colour, see `Light.white`, or images have channels."""
+        found = [one.light.white for one in self.by_source]
+        if self.colored or None in found:
+            return None
+        fractions = self.source.fractions if len(found) > 1 else (1.0,)
+        large, luminous, small = (np.array(fractions) @ np.array(found)).tolist()
+        return large, luminous, small
 
     @property
     def bands(self) -> tuple[Band, ...]:
@@ -209,7 +226,7 @@ class Scene:
         if len(self.source.members) > 1:
             each = zip(self.by_source, self.source.fractions, strict=True)
             return tuple(
-                replace(band, weight=fraction * band.weight, member=k)
+                replace(band, weight=fraction * band.weight, member=k, colour=band.colour or scene_of_member.light.white)
                 for k, (scene_of_member, fraction) in enumerate(each)
                 for band in scene_of_member.bands
             )
@@ -218,10 +235,12 @@ class Scene:
             if len(states) == 1:
                 return (Band(self),)
             return tuple(Band(replace(self, light=Light(state)), 1.0 / len(states)) for state in states)
-        bands = []
-        for wavelength, fraction, channel in zip(self.light.wavelengths, self.light.fractions, self.light.channels, strict=True):
+        bands, light = [], self.light
+        for wavelength, fraction, channel, colour in zip(
+            light.wavelengths, light.fractions, light.channels, light.colours_of(light.wavelengths), strict=True
+        ):
             scene = self.at(wavelength) if self.dispersive else self
-            bands += [Band(replace(scene, light=Light(state)), fraction / len(states), channel) for state in states]
+            bands += [Band(replace(scene, light=Light(state)), fraction / len(states), channel, colour) for state in states]
         return tuple(bands)
 
 

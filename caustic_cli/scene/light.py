@@ -22,8 +22,9 @@ spectra = OnDemand("caustic_cli.scene.spectrum")
 RGB = (611.4, 549.1, 464.3)
 #: Largest number of wavelengths of one source: each takes a trace.
 MAX_WAVELENGTHS = 99
-#: Wavelengths that represent a continuous spectrum: as traced through a dispersive glass, and in the verdict on a wave image.
-RAY_NODES, WAVE_NODES = 5, 9
+#: Wavelengths that represent a continuous spectrum: as traced through a dispersive glass, and in the verdict on a wave image, where
+#: an even number lies between the odd one that most designs have.
+RAY_NODES, WAVE_NODES = 5, 10
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,19 @@ class Light:
             return whole.rule(WAVE_NODES)
         parts = dict(zip(sorted(wavelengths), whole.weights_at(np.array(sorted(wavelengths))).tolist(), strict=True))
         return wavelengths, tuple(parts[w] for w in wavelengths)
+
+    @cached_property
+    def white(self) -> tuple[float, float, float] | None:
+        """Tristimulus values X, Y, Z, with Y = 1, of its light on a white screen; None for light without colour: nothing is said
+        about its spectrum, it has spectral lines, or is measured by its power."""
+        return None if self.measure is None or self.measure.detector != "eye" else self.measure.white
+
+    def colours_of(self, wavelengths: tuple[float, ...]) -> tuple[tuple[float, float, float] | None, ...]:
+        """Tristimulus values, with Y = 1, of the light that each of its wavelengths, nm, represents; None without colour."""
+        if self.white is None or self.measure is None:
+            return (None,) * len(wavelengths)
+        found = dict(zip(sorted(wavelengths), self.measure.colours_at(np.array(sorted(wavelengths))).tolist(), strict=True))
+        return tuple((x, y, z) for x, y, z in map(found.__getitem__, wavelengths))
 
     @property
     def mean(self) -> float:

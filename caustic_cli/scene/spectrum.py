@@ -16,6 +16,7 @@ Gauss rule, whose nodes crowd where there is little light, needs 17 for 1 %.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -250,13 +251,43 @@ class Measure:
         weights = np.maximum(np.diff(self._cumulative(0.5 * (at[1:] + at[:-1])), prepend=0.0, append=1.0), 0.0)
         return weights / weights.sum()
 
+    @cached_property
+    def white(self) -> tuple[float, float, float]:
+        """Tristimulus values of all its light for the CIE 1931 2-degree observer, with Y = 1."""
+        x, y, z = self._tristimulus_up_to(self._knots[-1:])[0]
+        return float(x / y), 1.0, float(z / y)
+
+    def colours_at(self, wavelengths: np.ndarray) -> np.ndarray:
+        """Tristimulus values (n, 3), with Y = 1, of the light nearest to each of given wavelengths (n,) nm, ascending.
+
+        Weighted by `weights_at` for the eye they add up to `white`.  Where there is no light they are those of the wavelength, or 0
+        if that is invisible.
+        """
+        at = np.asarray(wavelengths, dtype=np.float64)
+        ends = np.concatenate([self._knots[:1], 0.5 * (at[1:] + at[:-1]), self._knots[-1:]])
+        xyz = np.diff(self._tristimulus_up_to(ends), axis=0)
+        xyz = np.where(xyz[:, 1:2] > 0, xyz, tristimulus(at))
+        return np.divide(xyz, xyz[:, 1:2], out=np.zeros_like(xyz), where=xyz[:, 1:2] > 0)
+
     def _cumulative(self, at: np.ndarray) -> np.ndarray:
         """Integral of w up to wavelengths, exact."""
+        return self._up_to(self._measured, at) / self._total
+
+    def _tristimulus_up_to(self, at: np.ndarray) -> np.ndarray:
+        """Integrals (n, 3) of S times the colour-matching functions up to wavelengths (n,) nm, exact."""
+
+        def of(column: int) -> Callable[[np.ndarray], np.ndarray]:
+            return lambda x: self.spectrum.at(x) * tristimulus(x)[..., column]
+
+        return np.stack([self._up_to(of(column), at) for column in range(3)], -1)
+
+    def _up_to(self, function: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> np.ndarray:
+        """Integral, up to wavelengths (n,) nm, of a polynomial between the knots."""
         knots = self._knots
-        sums = np.concatenate([[0.0], np.cumsum(self._integrals)])
+        sums = np.concatenate([[0.0], np.cumsum(_integrals(function, knots[:-1], knots[1:]))])
         at = np.clip(at, knots[0], knots[-1])
         k = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
-        return (sums[k] + _integrals(self._measured, knots[k], at)) / sums[-1]
+        return sums[k] + _integrals(function, knots[k], at)
 
     def _measured(self, x: np.ndarray) -> np.ndarray:
         """S V or S."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
 from caustic_cli.io.files import atomic_file
-from caustic_cli.io.picture import SOFTWARE, to_linear, to_srgb
+from caustic_cli.io.picture import SOFTWARE, codes_of, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
 from caustic_cli.studies.irradiance import in_units
 from caustic_cli.studies.radius import cost_of_radius
@@ -45,6 +46,20 @@ PLACES = {"left": 0.035, "right": 0.95, "bottom": 0.065, "top": 0.925, "wspace":
 #: Height of a panel of losses relative to that of the error, if that is another panel, and the space between panels relative to
 #: their mean height.
 LESS, BETWEEN = 0.5, 0.6
+
+
+#: The value shown as white -> linear R, G, B (3, n_x, n_y) of an image, see `studies.viewing.in_colour`.
+Colours = Callable[[float], np.ndarray]
+
+
+class Shown(NamedTuple):
+    """An image of the report: absolute irradiance, (n_x, n_y); title; prefix of its figures, None for the target; and, for one in
+    colour, linear R, G, B (3, n_x, n_y) from 0 to 1 by the irradiance shown as white."""
+
+    picture: np.ndarray
+    title: str
+    prefix: str | None
+    colours: Colours | None = None
 
 
 @dataclass(frozen=True)
@@ -83,6 +98,7 @@ def write_report(
     encoding: str,
     waves: np.ndarray | None = None,
     stages: Sequence[tuple[float, bool]] = (),
+    colours: Sequence[Colours | None] = (None, None),
 ) -> None:
     """Write the panels.
 
@@ -94,6 +110,7 @@ def write_report(
         history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
         waves: (n_x, n_y), the wave image, or None; if given, the error is that of the wave image.
         stages: of each, the blur in its loss, pixels, and whether it uses the wave image.
+        colours: of the image by rays and by waves, where they are shown in colour.
     """
     import matplotlib  # noqa: PLC0415
 
@@ -103,7 +120,7 @@ def write_report(
     figure = plt.figure(figsize=(22.0, 9.8))
     axes = figure.subplots(2, 4, gridspec_kw=PLACES)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
-    shown = _images(image, waves, figures)
+    shown = _images(image, waves, figures, colours)
     _draw_images(axes[0], target, shown, figures, extent, encoding)
     _draw_error(axes[0, len(shown) + 1], target, image if waves is None else waves, extent)
     if len(shown) == 1:
@@ -128,34 +145,36 @@ def write_report(
     plt.close(figure)
 
 
-def _images(image: np.ndarray, waves: np.ndarray | None, figures: dict) -> list[tuple[np.ndarray, str, str]]:
-    """Irradiance, title, and prefix of the figures of each image, that which judges the lens last."""
+def _images(image: np.ndarray, waves: np.ndarray | None, figures: dict, colours: Sequence[Colours | None]) -> list[Shown]:
+    """What is drawn, the image that judges the lens last."""
 
-    def absolute(picture: np.ndarray, title: str, prefix: str) -> tuple[np.ndarray, str, str]:
-        error = figures[f"{prefix}relative_rms"]
+    def absolute(picture: np.ndarray, title: str, prefix: str, colours: Colours | None) -> Shown:
+        error, scale = figures[f"{prefix}relative_rms"], figures[f"{prefix}peak_irradiance"] / (picture.max() or 1.0)
         words = title if error is None else f"{title}\nrelative RMS error {error:.3f}"
-        return picture * (figures[f"{prefix}peak_irradiance"] / (picture.max() or 1.0)), words, prefix
+        if colours is None or not scale > 0:
+            return Shown(picture * scale, words, prefix)
+        return Shown(picture * scale, words, prefix, lambda white: colours(white / scale) / (white / scale))
 
     if waves is not None:
-        return [absolute(image, "ray image", ""), absolute(waves, "wave image", "wave_")]
-    judged, title, prefix = absolute(image, "caustic", "")
+        return [absolute(image, "ray image", "", colours[0]), absolute(waves, "wave image", "wave_", colours[1])]
+    judged = absolute(image, "caustic", "", colours[0])
     least = f", at least {figures['least_relative_rms']:.3f}" if "least_relative_rms" in figures else ""
-    return [(judged, title + least, prefix)]
+    return [judged._replace(title=judged.title + least)]
 
 
 def _draw_images(
     axes: Sequence[Axes],
     target: np.ndarray,
-    shown: list[tuple[np.ndarray, str, str]],
+    shown: list[Shown],
     figures: dict,
     extent: Sequence[float],
     encoding: str,
 ) -> None:
     """The target and the images; the target and the one that judges the lens at the same exposure."""
-    judged = shown[-1][0]
+    judged = shown[-1].picture
     goal = target * (judged.sum() / target.sum())
     white = max(float(goal.max()), float(judged.max()))  # of both
-    for axis, (picture, title, prefix) in zip(axes, [(goal, "target", None), *shown], strict=False):
+    for axis, (picture, title, prefix, colours) in zip(axes, [Shown(goal, "target", None), *shown], strict=False):
         top = white if picture is goal or picture is judged else float(picture.max())
         top = top if top > DARK else 1.0
         norm = (
@@ -164,6 +183,8 @@ def _draw_images(
             else Normalize(0.0, top, clip=True)
         )
         drawn = _draw_image(axis, picture, extent, title, cmap="gray", norm=norm)
+        if colours is not None:
+            axis.imshow(codes_of(colours(top), 1.0, encoding), extent=tuple(extent))
         if prefix is not None:
             _bar(drawn, axis, _irradiance_words(figures, prefix))
 

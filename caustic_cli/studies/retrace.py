@@ -137,14 +137,17 @@ def limited_to_source(image: Image) -> Image:
         return image
     scale = 1.0 / (1.0 - missed)
     lost = {name: 0.0 if name == "missed_lens" else scale * part for name, part in image.lost.items()}
-    return Image(scale * image.image, scale * image.leaving, lost, image.rays)
+    xyz = None if image.xyz is None else scale * image.xyz
+    return Image(scale * image.image, scale * image.leaving, lost, image.rays, xyz)
 
 
 def mean_of(parts: list[Image]) -> Image:
     """The mean of several images with the same number of rays each."""
     lost = {name: math.fsum(p.lost[name] for p in parts) / len(parts) for name in parts[0].lost}
     leaving = math.fsum(p.leaving for p in parts) / len(parts)
-    return Image(torch.stack([p.image for p in parts]).mean(0), leaving, lost, sum(p.rays for p in parts))
+    xyz = [p.xyz for p in parts if p.xyz is not None]
+    mean = torch.stack(xyz).mean(0) if xyz else None
+    return Image(torch.stack([p.image for p in parts]).mean(0), leaving, lost, sum(p.rays for p in parts), mean)
 
 
 def retrace(

@@ -423,7 +423,7 @@ def _run(
         limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - expected_seconds(designer, state))
     records = _Records(project, designer)
     watch = _Watch(project, designer, records, say, movie)
-    movie.begin(problem.scene.screen)
+    movie.begin(problem.scene)
     with _signals(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
             records.keep(state)
@@ -453,8 +453,7 @@ def _run(
             evaluated = evaluate_and_write(project, designer, state, timed)
         made = manufacture.wall_and_stock(problem.scene, designer.field(evaluated.state.stage), designer.exit(evaluated.state))
         result = _finished(project, designer, evaluated, made, began, records)
-        shown = evaluated.image if evaluated.waves is None else evaluated.waves
-        result = replace(result, figures=result.figures | movie.finish(shown, evaluated.figures, say))
+        result = replace(result, figures=result.figures | movie.finish(evaluated.shown, evaluated.figures, say))
         if asked:
             raise Interrupted(f"interrupted after the design had ended; {project.path} is complete", 128 + asked[0])
     if not timed and (words := problem.advice(project.settings.target.size)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.retrace import evaluation_rays, retrace, white_level
+from caustic_cli.studies.viewing import as_viewed, in_colour
 
 design_report, by_waves = OnDemand("caustic_cli.studies.design_report"), OnDemand("caustic_cli.studies.waves")
 
@@ -40,12 +42,14 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
     if project.path is None:
         return evaluated
     encoding = project.settings.target.encoding
-    seen, aim = (irradiance(a, designer.scene.screen) for a in (evaluated.image, target))
+    scene, screen = designer.scene, designer.scene.screen
+    seen, aim = (irradiance(a, screen) for a in (evaluated.image, target))
+    xyz = None if evaluated.xyz is None else irradiance(evaluated.xyz, screen)
     made = uptodate.image_provenance(project, evaluated.state.heights, evaluated.figures)
-    write_image(project.path / RENDER, seen, white_level(seen, aim), encoding, WIDE, made)
+    write_image(project.path / RENDER, *as_viewed(scene, seen, aim, xyz), encoding, WIDE, made)
     discard(project.path / WAVE)  # of an earlier lens
     if evaluated.waves is not None:
-        write_image(project.path / WAVE, evaluated.waves, white_level(evaluated.waves, target), encoding, WIDE)
+        write_image(project.path / WAVE, *as_viewed(scene, evaluated.waves, target, evaluated.waves_xyz), encoding, WIDE)
     discard(project.path / FARTHER)
     if evaluated.farther is not None:
         write_image(project.path / FARTHER, evaluated.farther[0], white_level(*evaluated.farther), encoding, WIDE)
@@ -59,12 +63,13 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
         grey(seen),
         surface,
         history,
-        designer.scene.lens,
-        designer.scene.screen,
+        scene.lens,
+        screen,
         evaluated.figures,
         encoding,
         None if evaluated.waves is None else grey(evaluated.waves),
         [(stage.rendering.blur, bool(stage.waves)) for stage in designer.stages],
+        [None if a is None else partial(in_colour, scene, a) for a in (xyz, evaluated.waves_xyz)],
     )
     return evaluated
 

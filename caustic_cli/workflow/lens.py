@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from caustic_cli.scene import Scene
 from caustic_cli.schema import checks
 from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import evaluation_rays, retrace
+from caustic_cli.studies.viewing import tristimulus_values
 from caustic_cli.studies.waves import height_deviation, wave_figures
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.export import Exporter
@@ -38,11 +39,19 @@ from caustic_cli.workflow.machining import FINER
 from caustic_cli.workflow.reporter import Listener, Reporter
 
 
-class Render(NamedTuple):
-    """image: power per pixel as a part of the source's, (n_x, n_y) or (3, n_x, n_y), float64; figures: as of `render json`."""
+@dataclass(frozen=True, eq=False)
+class Render:
+    """A rendered image with its figures; `image, figures = lens.render()` takes it apart."""
 
+    #: Power per pixel as a part of the source's, (n_x, n_y) or (3, n_x, n_y), float64.
     image: np.ndarray
+    #: As of `render json`.
     figures: dict[str, Any]
+    #: (3, n_x, n_y) tristimulus values on the same scale, Y that of the image; None for light without colour (`Scene.white`).
+    xyz: np.ndarray | None = None
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.image, self.figures))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +193,7 @@ class Lens:
             dtype=dtype,
             requests=plan.requests,
         )
-        return Render(exposure.image.cpu().numpy(), judged(figures, False))
+        return Render(exposure.image.cpu().numpy(), judged(figures, False), tristimulus_values(plan.scene, exposure))
 
     def render_waves(
         self, *, effects: str | Plan = "auto", required: bool = True, device: str = "cpu", cut: CutSurface | None = None
@@ -206,7 +215,9 @@ class Lens:
             required=required,
             perturbation=None if cut is None else height_deviation(cut, self.field, self.heights),
         )
-        return Render(np.empty((0, 0)) if light is None else light.image.cpu().numpy(), judged(figures, True))
+        if light is None:
+            return Render(np.empty((0, 0)), judged(figures, True))
+        return Render(light.image.cpu().numpy(), judged(figures, True), tristimulus_values(plan.scene, light))
 
     def export(
         self,

@@ -15,12 +15,13 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from caustic_cli.inverse.designer import State
+from caustic_cli.inverse.target import grey
 from caustic_cli.io.picture import codes_of
 from caustic_cli.loading import OnDemand
-from caustic_cli.scene import Screen
+from caustic_cli.scene import Scene
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.studies.retrace import white_level
+from caustic_cli.studies.viewing import as_viewed
 from caustic_cli.workflow.reporter import Reporter
 
 movies = OnDemand("caustic_cli.io.movie")
@@ -46,15 +47,15 @@ class NoMovie:
 
     recorded = False
 
-    def begin(self, screen: Screen) -> None:
-        """Record images on this screen, by whose pixel areas power is converted to irradiance."""
+    def begin(self, scene: Scene) -> None:
+        """Record images of this scene, by whose screen's pixel areas power is converted to irradiance."""
 
     def record(self, state: State, target: np.ndarray, encoding: str, waves: bool) -> None:
         """Record the image of the last iteration; waves: whether it is a wave image."""
 
     def finish(self, image: np.ndarray, figures: dict[str, Any], say: Reporter) -> dict[str, str]:
-        """Record the image of the finished lens with the figures of its evaluation, as the last frame, and write; the figures of
-        the recording."""
+        """Record the image of the finished lens, or the tristimulus values of light with colour, with the figures of its evaluation
+        as the last frame, and write; the figures of the recording."""
         return {}
 
     def write(self) -> None:
@@ -85,10 +86,10 @@ class Movie(NoMovie):
         self._target: np.ndarray | None = None
         self._encoding = "srgb"
         self._last = ""
-        self.screen: Screen | None = None
+        self.scene: Scene | None = None
 
-    def begin(self, screen: Screen) -> None:
-        self.screen = screen
+    def begin(self, scene: Scene) -> None:
+        self.scene = scene
 
     def record(self, state: State, target: np.ndarray, encoding: str, waves: bool) -> None:
         self._target, self._encoding, self._seen = target, encoding, self._seen + 1
@@ -121,14 +122,20 @@ class Movie(NoMovie):
 
     def _error(self, image: np.ndarray) -> float:
         assert self._target is not None
-        grey, goal = (a.sum(0) if a.ndim == 3 else a for a in (image, self._target))
-        return relative_rms(grey, goal)
+        return relative_rms(grey(self._luminous(image)), grey(self._target))
+
+    def _luminous(self, image: np.ndarray) -> np.ndarray:
+        """Y of tristimulus values; another image as it is."""
+        return image if self.scene is None or self.scene.white is None or image.ndim == 2 else image[1]
 
     def _add(self, image: np.ndarray, *words: str) -> None:
-        target = self._target
-        if self.screen is not None:
-            image, target = irradiance(image, self.screen), None if target is None else irradiance(target, self.screen)
-        self.frames.append(Frame(codes_of(image, white_level(image, target), self._encoding), (words[0], words[1])))
+        target, scene = self._target, self.scene
+        if scene is not None:
+            image, target = irradiance(image, scene.screen), None if target is None else irradiance(target, scene.screen)
+        seen, xyz = self._luminous(image), None
+        if scene is not None and scene.white is not None:
+            xyz = image if image.ndim == 3 else np.array(scene.white)[:, None, None] * image
+        self.frames.append(Frame(codes_of(*as_viewed(scene, seen, target, xyz), self._encoding), (words[0], words[1])))
 
 
 def recorder(path: Path | None, force: bool) -> NoMovie:
@@ -145,6 +152,6 @@ def _drawn(frame: Frame) -> Image.Image:
     sheet.paste(picture, ((width - picture.width) // 2, 0))
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), LETTERS)
-    for k, (line, grey) in enumerate(zip(frame.words, (235, 170), strict=True)):
-        draw.text((10, HEIGHT + 4 + k * LINE), line, fill=grey if sheet.mode == "L" else (grey,) * 3, font=font)
+    for k, (line, shade) in enumerate(zip(frame.words, (235, 170), strict=True)):
+        draw.text((10, HEIGHT + 4 + k * LINE), line, fill=shade if sheet.mode == "L" else (shade,) * 3, font=font)
     return sheet

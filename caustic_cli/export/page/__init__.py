@@ -29,6 +29,7 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.export.surface import sample_grid
+from caustic_cli.io.colorimetry import rgb_matrix
 from caustic_cli.io.files import CREATED_BY, write_bytes
 from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.resampling import resampled
@@ -95,6 +96,7 @@ def write_page(
     rows: Sequence[tuple[str, str]] = (),
     notes: Sequence[str] = (),
     waves: np.ndarray | None = None,
+    waves_xyz: np.ndarray | None = None,
     encoding: str = "srgb",
 ) -> None:
     """Write the page.
@@ -104,7 +106,7 @@ def write_page(
         heights: (n, m) control heights, mm.
         target: (n_x, n_y) or (3, n_x, n_y) on the scene's screen, any scale; None for a page without it.
         title: of the page; rows: names and figures of a table; notes: sentences below it.  All text is escaped.
-        waves: the wave image, like `target`.
+        waves: the wave image, like `target`; waves_xyz: its tristimulus values (3, n_x, n_y), for light with colour.
         encoding: of displayed images, srgb or linear.
 
     Raises:
@@ -121,6 +123,7 @@ def write_page(
         "encoding": encoding,
         "target": None if target is None else _coded(_onto(target, screen)),
         "waves": None if waves is None else _coded(_onto(waves, screen)),
+        "wavesColour": None if waves_xyz is None else [_coded(_onto(c, screen)) for c in _primaries(scene, waves_xyz)],
     }
     words = {
         "title": html.escape(title),
@@ -219,20 +222,30 @@ def _coded(values: np.ndarray) -> dict:
     return {"shape": list(values.shape), "low": low, "step": span / 65535.0, "data": base64.b64encode(deflated).decode()}
 
 
+def _primaries(scene: Scene, xyz: np.ndarray) -> np.ndarray:
+    """Linear R, G, B of sRGB, of any sign, of tristimulus values (3, ...), in which the light of the sources is grey."""
+    assert scene.white is not None
+    return np.tensordot(rgb_matrix(scene.white), xyz, 1)
+
+
 def _lights(scene: Scene) -> list[dict]:
-    """The sources: fraction of the total power of each, and its refractive indices with their weights."""
+    """The sources: fraction of the total power of each, and its refractive indices, each with its weight and, where the colour
+    differs, linear R, G, B by its power."""
     lights = []
     for k, one in enumerate(scene.by_source):
-        indices: dict[float, float] = {}
-        for band in scene.bands:
-            if band.member in (None, k):
-                index = band.scene.lens.inside
-                indices[index] = indices.get(index, 0.0) + band.weight
-        total = math.fsum(indices.values())
+        bands = [band for band in scene.bands if band.member in (None, k)]
+        total = math.fsum(band.weight for band in bands)
+        indices = {}
+        for index in dict.fromkeys(band.scene.lens.inside for band in bands):
+            same = [band for band in bands if band.scene.lens.inside == index]
+            weights = np.array([band.weight for band in same])
+            colours = [band.colour for band in same if band.colour is not None]
+            mean = _primaries(scene, weights @ np.array(colours) / weights.sum()).tolist() if colours else None
+            indices[index] = (weights.sum() / total, mean)
         lights.append(
             {
                 "weight": scene.source.fractions[k],
-                "indices": [[index, part / total] for index, part in indices.items()],
+                "indices": [[index, *of] for index, of in indices.items()],
                 **_source(one, one.source),
             }
         )

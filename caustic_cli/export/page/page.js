@@ -50,7 +50,8 @@ async function unpacked() {
   const [nx, ny] = held.cloud.z.shape, parts = {};
   for (const [name, part] of Object.entries(held.cloud)) parts[name] = part && (await decoded(part));
   const target = held.target && (await decoded(held.target)), waves = held.waves && (await decoded(held.waves));
-  return { cloud: { nx, ny, ...parts }, target, waves };
+  const wavesColour = held.wavesColour && (await Promise.all(held.wavesColour.map(decoded)));
+  return { cloud: { nx, ny, ...parts }, target, waves, wavesColour };
 }
 
 // ---- the light: beams for a setting of the controls
@@ -96,15 +97,15 @@ function beamsOf(setting, most = MOST_BEAMS) {
     if (light.picture && count > 1) count = Math.min(most, light.picture.length);
     light.places.forEach(([x, y, z, part], place) => {
       for (const [u, v] of spots(light, count, places, place)) {
-        for (const [n, of] of light.indices) {
+        for (const [n, of, colour] of light.indices) {
           const power = (light.weight * part * of) / count;
           if (light.near) {
             const [x0, y0, z0] = turned(rows, [x + extent[0] * u, y + extent[1] * v, z]);
-            beams.push({ near: true, x0, y0, h: -z0, n, power, axis: rows.map((row) => row[2]), light });
+            beams.push({ near: true, x0, y0, h: -z0, n, power, axis: rows.map((row) => row[2]), light, colour });
           } else {
             const sx = extent[0] * u, sy = extent[1] * v;
             const [ax, ay] = turned(rows, [sx, sy, Math.sqrt(1 - sx * sx - sy * sy)]);
-            beams.push({ near: false, ax, ay, n, power: power / area, light });
+            beams.push({ near: false, ax, ay, n, power: power / area, light, colour });
           }
         }
       }
@@ -403,6 +404,7 @@ function graphicsTracer(cloud, slowToo) {
 
 const sum = (values) => values.reduce((a, b) => a + b, 0);
 const most = (values) => values.reduce((a, b) => Math.max(a, b), 0);
+const LUMINANCE = [0.2126, 0.7152, 0.0722]; // of linear sRGB
 const srgb = (v) => (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055);
 
 /** Paint a canvas from a function of the pixel's index that gives red, green and blue, 0 to 255. */
@@ -417,12 +419,20 @@ function paint(canvas, colour) {
   context.putImageData(picture, 0, 0);
 }
 
-/** Show irradiance as render.png does: white is the target's greatest at the image's power. */
-function paintLight(canvas, image, white) {
-  paint(canvas, (k) => {
-    const value = Math.min(1, Math.max(0, image[k] / (white || 1))), code = 255 * (held.encoding === "srgb" ? srgb(value) : value);
-    return [code, code, code];
-  });
+const clamped = (v) => Math.min(1, Math.max(0, v));
+
+/** Linear red, green and blue moved towards the grey of their luminance until all are 0 to 1. */
+function intoGamut(rgb) {
+  const grey = clamped(rgb.reduce((all, v, c) => all + LUMINANCE[c] * v, 0));
+  const kept = Math.min(1, ...rgb.map((v) => (v > grey ? (1 - grey) / (v - grey) : v < grey ? grey / (grey - v) : 1)));
+  return rgb.map((v) => clamped(grey + kept * (v - grey)));
+}
+
+/** Show irradiance as render.png does: white is the target's greatest at the image's power; in colour where `planes` of linear red,
+ * green and blue are given. */
+function paintLight(canvas, image, white, planes = null) {
+  const shown = (k) => (planes ? intoGamut(planes.map((plane) => plane[k] / (white || 1))) : Array(3).fill(clamped(image[k] / (white || 1))));
+  paint(canvas, (k) => shown(k).map((v) => 255 * (held.encoding === "srgb" ? srgb(v) : v)));
 }
 
 /** Blue below 0, red above, to +-1. */
@@ -570,7 +580,7 @@ const tidy = (v, digits = 5) => Number(v.toPrecision(digits));
 
 async function start() {
   if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the page's data.");
-  const { cloud, target, waves } = await unpacked(), range = ranges(), asked = new URLSearchParams(location.hash.slice(1));
+  const { cloud, target, waves, wavesColour } = await unpacked(), range = ranges(), asked = new URLSearchParams(location.hash.slice(1));
   const names = ["throw", "leanx", "leany", "size"], touched = new Set();
   solidView(byId("solid"), cloud);
   byId("scale").textContent = `${held.screen.resolution.map((m, k) => tidy(m * held.screen.pixel[k], 4)).join(" × ")} mm, ${held.screen.resolution.join(" × ")} pixels.`;
@@ -578,7 +588,7 @@ async function start() {
   byId("size-unit").textContent = range.size.unit;
   if (target) paintLight(byId("target"), target, most(target));
   for (const id of target ? [] : ["target-figure", "difference-figure", "rms-row"]) byId(id).hidden = true;
-  if (waves) paintLight(byId("waves"), waves, target ? (most(target) / sum(target)) * sum(waves) : most(waves));
+  if (waves) paintLight(byId("waves"), waves, target ? (most(target) / sum(target)) * sum(waves) : most(waves), wavesColour);
   if (waves && target) byId("waves-rms").textContent = compared(waves, target).rms.toFixed(3);
   for (const id of ["waves-figure", "waves-row"]) byId(id).hidden = !waves || (id === "waves-row" && !target);
 
@@ -640,9 +650,24 @@ async function start() {
   }
   const traced = (beams, z, thin) => (graphics && byId("gpu").checked ? graphics.traced(beams, z, thin) : tracedHere(cloud, beams, z, thin));
 
-  function show(image, beams, thin, began) {
+  /** The image of all beams, and its planes of red, green and blue, null if all light has the colour of the source. */
+  function* seen(beams, z, thin) {
+    const colours = [...new Set(beams.map((beam) => beam.colour))];
+    if (colours.every((colour) => !colour)) return { image: yield* traced(beams, z, thin), planes: null };
+    const [image, ...planes] = Array.from({ length: 4 }, () => new Float64Array(held.screen.resolution[0] * held.screen.resolution[1]));
+    for (const colour of colours) {
+      const part = yield* traced(beams.filter((beam) => beam.colour === colour), z, thin);
+      part.forEach((v, k) => {
+        image[k] += v;
+        for (let c = 0; c < 3; c++) planes[c][k] += colour[c] * v;
+      });
+    }
+    return { image, planes };
+  }
+
+  function show({ image, planes }, beams, thin, began) {
     const total = sum(image), white = target ? (most(target) / sum(target)) * total : most(image);
-    paintLight(byId("caustic"), image, white);
+    paintLight(byId("caustic"), image, white, planes);
     byId("light").textContent = `${(100 * total).toFixed(1)} %`;
     if (target) {
       const { error, rms } = compared(image, target);
@@ -657,14 +682,15 @@ async function start() {
     const mine = ++turn, now = setting(), began = performance.now();
     try {
       const quick = beamsOf(now, 24), coarse = Math.min(32, 4 * 2 ** Math.ceil(Math.log2(Math.sqrt(quick.length))));
-      const first = await finished(traced(quick, now.z, coarse), mine);
+      const first = await finished(seen(quick, now.z, coarse), mine);
       if (!first) return null;
       show(first, quick, coarse, began);
       await new Promise((go) => setTimeout(go));
       if (mine !== turn) return null;
-      const beams = beamsOf(now), thin = thinning(beams.length), image = await finished(traced(beams, now.z, thin), mine);
-      if (image) show(image, beams, thin, began);
-      return image;
+      const beams = beamsOf(now), thin = thinning(beams.length), found = await finished(seen(beams, now.z, thin), mine);
+      if (!found) return null;
+      show(found, beams, thin, began);
+      return found.image;
     } catch (error) {
       if (!graphics || mine !== turn) throw error;
       graphics = null; // lost to another program, or out of memory: the processor goes on

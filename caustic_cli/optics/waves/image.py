@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.emission.coherent import Mode, central_mode, modes, outermost_modes, spots
+from caustic_cli.optics.image import with_colour
 from caustic_cli.optics.interaction import Parameters
 from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.spread import POINT, Convolution, Spread, spread_of
@@ -54,13 +55,15 @@ Perturbation = Callable[[Tensor, Tensor], Tensor]
 @dataclass(frozen=True)
 class Line:
     """One spectral line: wavelength, nm; fraction of the power; the system at this wavelength; label, the wavelength at which media
-    are evaluated (None if the system has the indices already); and the channel of a coloured image."""
+    are evaluated (None if the system has the indices already); the channel of a coloured image; and the colour of the light that it
+    represents, as of `scene.Band`."""
 
     wavelength: float
     part: float
     system: System
     label: float | None = None
     channel: int | None = None
+    colour: tuple[float, float, float] | None = None
 
     @property
     def length(self) -> float:
@@ -79,7 +82,7 @@ class WaveImage:
 
     image: float64, differentiable if the heights were; leaving: power behind the system; off_screen: power outside the pixels;
     wavelengths: nm; points: number of source points; spread_error: displacement error of the point-spread approximation, mm;
-    samples: of the largest transform along each axis.
+    samples: of the largest transform along each axis; xyz: tristimulus values, as of `optics.image.Image`.
     """
 
     image: Tensor
@@ -89,6 +92,7 @@ class WaveImage:
     points: int
     spread_error: float
     samples: tuple[int, int]
+    xyz: Tensor | None = None
 
 
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
@@ -105,7 +109,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
     given, parts = scene.light.lines(wavelengths or ())
     channels = scene.light.channels if given is scene.light.wavelengths else (None,) * len(given)
     states = (0.0, 90.0) if scene.light.tracked and scene.light.polarisation is None else (scene.light.polarisation,)
-    for wavelength, part, channel in zip(given, parts, channels, strict=True):
+    for wavelength, part, channel, colour in zip(given, parts, channels, scene.light.colours_of(given), strict=True):
         lens = replace(scene.lens, roughness=0.0)
         if (glass := lens.interior.glass) is not None:
             lens = replace(lens, index=nearest_index(glass, wavelength))
@@ -113,7 +117,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
             if (lens.index, state) not in systems:  # light of one index and polarisation takes the same paths
                 one = replace(scene, lens=lens, light=Light(state))
                 systems[lens.index, state] = System.of(one, field)
-            found.append(Line(wavelength, part / len(states), systems[lens.index, state], None, channel))
+            found.append(Line(wavelength, part / len(states), systems[lens.index, state], None, channel, colour))
     return found
 
 
@@ -192,6 +196,7 @@ def image_of(
             sum(w.points for w in found),
             max(w.spread_error for w in found),
             max(w.samples for w in found),
+            cast(Tensor, sum(w.xyz for w in found)) if all(w.xyz is not None for w in found) else None,
         )
     )
 
@@ -298,7 +303,7 @@ class Imager:
         """The wave image of these lines, at heights {name: (n, m) mm} close to those for which the sampling was chosen."""
         colours = [line.channel for line in lines if line.channel is not None]
         images: dict[int | None, Tensor] = {}
-        leaving = 0.0
+        leaving, xyz = 0.0, None
         for group in _alike(lines):
             for k, mode in enumerate(self.modes(group[0].system)):
                 front = self.front(group[0], mode, parameters)
@@ -306,6 +311,7 @@ class Imager:
                     part, power = self.image(line, front, k, dtype)
                     images[line.channel] = images.get(line.channel, 0.0) + line.part * part
                     leaving += line.part * power
+                    xyz = with_colour(xyz, line.part * part, line.colour)
         some = next(iter(images.values()))
         image = torch.stack([images.get(k, torch.zeros_like(some)) for k in range(3)]) if colours else some
         return WaveImage(
@@ -316,6 +322,7 @@ class Imager:
             len(self.modes(lines[0].system)),
             self.spread.error / math.sqrt(max(1, self.each)),
             self.sampling.padded,
+            xyz,
         )
 
     def modes(self, system: System) -> list[Mode]:

@@ -108,7 +108,8 @@ def combined(first: Source, section: Table) -> Source:
         return first
     others = (type_of(table["type"], "⟨source.also.type⟩").from_settings(table, None) for table in section["also"])
     lights = several.lights_of(section)
-    return several.Several((first, *others), tuple((light.wavelengths, light.weights) for light in lights))
+    samples = tuple((light.wavelengths, light.weights) for light in lights)
+    return several.Several((first, *others), samples, tuple(light.measure for light in lights))
 
 
 def __getattr__(name: str) -> Any:

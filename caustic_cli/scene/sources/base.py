@@ -22,6 +22,7 @@ from caustic_cli.scene.sources.distribution import Distribution
 
 if TYPE_CHECKING:
     from caustic_cli.scene.sources.rayset import RaySet
+    from caustic_cli.scene.spectrum import Measure
 
 #: Relative margin of a cone that just covers the aperture, so that rounding leaves no corner dark.
 SLACK = 1e-9
@@ -37,7 +38,7 @@ class Source:
     except where errors of alignment tilt it; collimated: see the module; rays: ray set of a file, None for a source
     that is sampled;
     brightness: relative radiance over `frame`, (a, b) [i, j], or None if uniform over an ellipse; spectra: of several sources,
-    wavelengths, nm, and relative powers of each.
+    wavelengths, nm, and relative powers of each; measures: and the continuous spectrum that these are samples of, or None.
     """
 
     kind: str
@@ -49,6 +50,7 @@ class Source:
     rays: RaySet | None = None
     brightness: np.ndarray | None = None
     spectra: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
+    measures: tuple[Measure | None, ...] = ()
 
     if TYPE_CHECKING:  # values of some types and properties of others: all that can be said of any is that they are read
 

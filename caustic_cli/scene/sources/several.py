@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from caustic_cli.scene.aperture import Pupil
 from caustic_cli.scene.light import RAY_NODES, Light
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.section import Table, content
+
+if TYPE_CHECKING:
+    from caustic_cli.scene.spectrum import Measure
 
 spectra = OnDemand("caustic_cli.scene.spectrum")
 
@@ -32,6 +36,8 @@ class Several(Source):
     members: tuple[Source, ...] = ()
     #: Wavelengths, nm, and relative powers of each; empty if not given.
     spectra: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
+    #: The continuous spectrum that these are samples of, of each, or None; empty if no source has one.
+    measures: tuple[Measure | None, ...] = ()
 
     kind = "several"
 
@@ -119,7 +125,7 @@ class Several(Source):
 
     def pointlike(self) -> Source:
         """Each without its extent."""
-        return Several(tuple(member.pointlike() for member in self.members), self.spectra)
+        return replace(self, members=tuple(member.pointlike() for member in self.members))
 
     def apparent_angle(self, z_in: float) -> float:
         """The largest."""

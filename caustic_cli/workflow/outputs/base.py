@@ -142,6 +142,9 @@ class Rendering:
     #: Power per pixel, and the wave image, None where there is none.
     image: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     waves: np.ndarray | None = None
+    #: Tristimulus values of both, None for light without colour.
+    xyz: np.ndarray | None = None
+    waves_xyz: np.ndarray | None = None
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -182,7 +185,8 @@ class Rendering:
         self.plan  # noqa: B018 - refuses first what stands in the light
         if coarse := coarse_words(self.scene):
             self.say.say(coarse)
-        self.image, self.figures = self.trace(tolerance=how.tolerance, filter=filter, cut=self.cut)
+        found = self.trace(tolerance=how.tolerance, filter=filter, cut=self.cut)
+        self.image, self.figures, self.xyz = found.image, found.figures, found.xyz
 
 
 @dataclass(eq=False)

@@ -60,6 +60,7 @@ class InteractivePage(Output):
             rows=[*_lens_rows(lens), *_light_rows(lens.scene), *_figure_rows(rendering.figures)],
             notes=_notes(rendering.plan),
             waves=rendering.waves,
+            waves_xyz=rendering.waves_xyz,
             encoding=lens.encoding,
         )
         return {"page": str(self.html)}

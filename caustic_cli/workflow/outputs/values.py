@@ -1,4 +1,4 @@
-"""The images as arrays, .npy: power per pixel as a fraction of the source's."""
+"""The images as arrays, .npy: power per pixel as a fraction of the source's; of light with colour X, Y, Z, Y on that scale."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class PixelValues(Output):
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """Write the arrays of the images that there are."""
-        write_npy(self.npy, rendering.image)
+        write_npy(self.npy, rendering.image if rendering.xyz is None else rendering.xyz)
         if rendering.waves is not None:
-            write_npy(beside(self.npy), rendering.waves)
+            write_npy(beside(self.npy), rendering.waves if rendering.waves_xyz is None else rendering.waves_xyz)
         return {}

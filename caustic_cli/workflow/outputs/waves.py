@@ -10,7 +10,7 @@ from caustic_cli.io.picture import write_image
 from caustic_cli.optics.plan import parse_effects
 from caustic_cli.project.project import WAVE, beside
 from caustic_cli.studies.metrics import judged
-from caustic_cli.studies.retrace import white_level
+from caustic_cli.studies.viewing import as_viewed
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
 
@@ -29,11 +29,12 @@ class WavePicture(Output):
         if not rendering.plan["diffraction"].on:
             return {}
         with rendering.say.notify_if_slow("computing the wave image"):
-            image, figures = lens.render_waves(
+            found = lens.render_waves(
                 effects=rendering.plan, required=effects != "auto", device=rendering.device, cut=rendering.cut
             )
+        image, figures = found
         if image.size:
-            write_image(path, image, white_level(image, lens.target), lens.encoding, place.wide)
-            rendering.waves = image
+            write_image(path, *as_viewed(lens.scene, image, lens.target, found.xyz), lens.encoding, place.wide)
+            rendering.waves, rendering.waves_xyz = image, found.xyz
             figures = figures | {"wave_image": str(path)}
         return judged(rendering.figures | figures, lens.by_waves or "diffraction" in (parse_effects(effects) or ()))

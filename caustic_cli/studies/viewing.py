@@ -1,0 +1,42 @@
+"""Images as seen by an eye that has adapted to the source, or a camera with that white balance."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from caustic_cli.loading import OnDemand
+from caustic_cli.optics.image import Image
+from caustic_cli.scene import Scene
+from caustic_cli.studies.retrace import white_level
+
+if TYPE_CHECKING:
+    from caustic_cli.optics.waves.image import WaveImage
+
+colorimetry = OnDemand("caustic_cli.io.colorimetry")
+
+
+def tristimulus_values(scene: Scene, found: Image | WaveImage) -> np.ndarray | None:
+    """X, Y, Z of an image (3, n_x, n_y), float64, Y that of the image; None for light without colour (`Scene.white`)."""
+    if scene.white is None:
+        return None
+    if found.xyz is None:  # light of the same colour everywhere
+        return np.array(scene.white)[:, None, None] * found.image.cpu().numpy()
+    return found.xyz.cpu().numpy()
+
+
+def as_viewed(
+    scene: Scene, image: np.ndarray, target: np.ndarray | None, xyz: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
+    """What is shown of an image of irradiance, and the value of white in it, for the exposure of the target.
+
+    xyz: tristimulus values, for linear R, G, B of sRGB (3, n_x, n_y) in which the light of the source is grey; the image without.
+    """
+    white = white_level(image, target)
+    return (image if xyz is None else in_colour(scene, xyz, white)), white
+
+
+def in_colour(scene: Scene, xyz: np.ndarray, white: float) -> np.ndarray:
+    """Linear R, G, B of sRGB (3, n_x, n_y), at most `white`, of tristimulus values (3, n_x, n_y); Y = `white` is shown as white."""
+    return white * colorimetry.xyz_to_rgb(xyz, scene.white, 1.0 / white if white > 0 else 0.0, axis=0)
