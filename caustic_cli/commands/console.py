@@ -319,6 +319,7 @@ def _of_image(figures: dict, prefix: str) -> list[tuple[str, str]]:
     rows = [
         ("PSNR", _number(figures, f"{prefix}psnr_db", ".2f") + " dB"),
         ("SSIM", _number(figures, f"{prefix}ssim", ".4f")),
+        *([("mean CIEDE2000", _number(figures, f"{prefix}ciede2000", ".2f"))] if f"{prefix}ciede2000" in figures else []),
         ("light on the screen", _number(figures, f"{prefix}on_screen", ".2%") + of),
         ("light on the picture", _number(figures, f"{prefix}on_target", ".2%")),
     ]
@@ -380,6 +381,8 @@ def _wave_image(figures: dict) -> list[tuple[str, str]]:
     if figures["wave_relative_rms"] is None:  # an archive has no target picture
         return [("wave image", f"on the screen {_number(figures, 'wave_on_screen', '.2%')}, {at}")]
     words = f"relative RMS error {_number(figures, 'wave_relative_rms', '.4f')}, {at}"
+    if "wave_ciede2000" in figures:
+        words += f"; mean CIEDE2000 {_number(figures, 'wave_ciede2000', '.2f')}"
     words += f"; on the picture {_number(figures, 'wave_on_target', '.2%')}"
     if figures.get("wave_in_black") is not None:
         words += f", in black {_number(figures, 'wave_in_black', '.2%')}"

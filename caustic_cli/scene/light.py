@@ -42,7 +42,7 @@ class Light:
     weights: tuple[float, ...] = ()
     #: Unpolarised light is traced as two orthogonal polarisations, since the entrance transmits s and p differently.
     tracked: bool = False
-    #: The wavelengths are red, green and blue, and the image has a channel for each.
+    #: The wavelengths are red, green and blue, and the image has a channel for each, the power of its light.
     color: bool = False
     #: Unit of the source's power: W (radiant flux) or lm (luminous flux).
     unit: str = "W"
@@ -70,11 +70,18 @@ class Light:
             raise InputError(
                 f"⟨source.wavelengths⟩ of a coloured picture are three, red, green and blue, got {len(self.wavelengths)}"
             )
+        if self.color:
+            self.primaries  # noqa: B018 - refuses wavelengths that mix no colours
 
     @property
     def effects(self) -> frozenset[str]:
         """Names of the effects on rays that it causes."""
         return frozenset(() if self.polarisation is None else {"polarisation"})
+
+    @cached_property
+    def primaries(self) -> np.ndarray:
+        """X, Y, Z of a unit of power in each colour channel, as the columns of a matrix, see `spectrum.primaries`."""
+        return spectra.primaries(self.wavelengths)
 
     @property
     def channels(self) -> tuple[int | None, ...]:

@@ -134,6 +134,8 @@ def _images(image: np.ndarray, waves: np.ndarray | None, figures: dict) -> list[
     def absolute(picture: np.ndarray, title: str, prefix: str) -> tuple[np.ndarray, str, str]:
         error = figures[f"{prefix}relative_rms"]
         words = title if error is None else f"{title}\nrelative RMS error {error:.3f}"
+        if figures.get(f"{prefix}ciede2000") is not None:
+            words += f", CIEDE2000 {figures[f'{prefix}ciede2000']:.1f}"
         return picture * (figures[f"{prefix}peak_irradiance"] / (picture.max() or 1.0)), words, prefix
 
     if waves is not None:

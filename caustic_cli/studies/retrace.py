@@ -20,7 +20,8 @@ from caustic_cli.optics.sampling import SOBOL_RAYS, stream
 from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Light, Scene
+from caustic_cli.studies.color_error import color_figures, shown
 from caustic_cli.studies.irradiance import irradiance_figures, source_figures, unit_figures
 from caustic_cli.studies.metrics import figures_of_merit
 from caustic_cli.studies.noise import black_error, image_noise, noise_bias, standard_error, variance_of
@@ -176,8 +177,8 @@ def retrace(
     Returns:
         the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by bincount,
         with the rays that were traced; noise, of relative_rms, None without a target; in_black_noise, of in_black, None without
-        that; error_estimate, the relative RMS noise of the image, None of a black one; those of `studies.irradiance`; with
-        `tolerance` also rays_traced.
+        that; error_estimate, the relative RMS noise of the image, None of a black one; those of `studies.irradiance` and of
+        `studies.color_error`, which is not corrected for noise; with `tolerance` also rays_traced.
     """
 
     def trace(name: str, count: int, light: Scene = scene) -> Image:
@@ -198,6 +199,7 @@ def retrace(
         counted, figures = _in_halves(trace, scene, target, rays, quiet)
     require_energy_balance(counted, dtype)
     figures |= irradiance_figures(scene, counted.image) | unit_figures(scene) | source_figures(scene, figures["on_target"])
+    figures |= color_figures(scene, counted.image, target)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     sampler = sampler_for(scene, counted.rays, seed, device)
@@ -286,3 +288,8 @@ def white_level(image: np.ndarray, target: np.ndarray | None) -> float:
     if target is None:
         return float(image.max()) or 1.0
     return float(target.max() / target.sum() * image.sum())
+
+
+def as_viewed(light: Light, image: np.ndarray, target: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """What is displayed of an image of irradiance, in colour its linear R, G, B, and the value of white there."""
+    return (shown(light, image, target), 1.0) if light.color else (image, white_level(image, target))

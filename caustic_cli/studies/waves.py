@@ -16,6 +16,7 @@ from caustic_cli.optics.waves.image import UNASKED, Perturbation, WaveImage, wav
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.materials import material
+from caustic_cli.studies.color_error import color_figures
 from caustic_cli.studies.irradiance import irradiance_figures
 from caustic_cli.studies.metrics import figures_of_merit
 
@@ -47,8 +48,8 @@ def wave_figures(
         wave_on_target, wave_in_black (None without a target), wave_on_screen, wave_wavelengths (nm), wave_spectrum and
         wave_detector, of the continuous spectrum that these represent, None for spectral lines, resolvable, the number of
         resolvable details across the picture, wave_source_points, the points that the source was taken as, wave_source_error, by
-        how much an extended source's light is misplaced so, mm, and wave_peak_irradiance and wave_mean_irradiance, as of a ray
-        image.
+        how much an extended source's light is misplaced so, mm, and wave_peak_irradiance, wave_mean_irradiance and, in colour,
+        wave_ciede2000, as of a ray image.
     """
     most = math.inf if required else UNASKED
     try:
@@ -65,7 +66,7 @@ def wave_figures(
             )
         ) | {"wave_wavelengths": [], "resolvable": seen.resolvable, "no_wave_image": str(error)}
     of, whole = _judged(found, target), scene.light.continuum
-    absolute = {f"wave_{name}": value for name, value in irradiance_figures(scene, found.image).items()}
+    further = irradiance_figures(scene, found.image) | color_figures(scene, found.image, target)
     return found, {
         **{f"wave_{name}": of[name] for name in _SAME},
         "wave_wavelengths": list(found.wavelengths),
@@ -74,7 +75,7 @@ def wave_figures(
         "resolvable": seen.resolvable,
         "wave_source_points": found.points,
         "wave_source_error": found.spread_error,
-    } | absolute
+    } | {f"wave_{name}": value for name, value in further.items()}
 
 
 def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray) -> dict:

@@ -423,7 +423,7 @@ def _run(
         limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - expected_seconds(designer, state))
     records = _Records(project, designer)
     watch = _Watch(project, designer, records, say, movie)
-    movie.begin(problem.scene.screen)
+    movie.begin(problem.scene)
     with _signals(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
             records.keep(state)

@@ -20,7 +20,7 @@ from caustic_cli.optics.system import trace_arguments
 from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.irradiance import irradiance
-from caustic_cli.studies.retrace import evaluation_rays, retrace, white_level
+from caustic_cli.studies.retrace import as_viewed, evaluation_rays, retrace, white_level
 
 design_report, by_waves = OnDemand("caustic_cli.studies.design_report"), OnDemand("caustic_cli.studies.waves")
 
@@ -42,10 +42,11 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
     encoding = project.settings.target.encoding
     seen, aim = (irradiance(a, designer.scene.screen) for a in (evaluated.image, target))
     made = uptodate.image_provenance(project, evaluated.state.heights, evaluated.figures)
-    write_image(project.path / RENDER, seen, white_level(seen, aim), encoding, WIDE, made)
+    light = designer.scene.light
+    write_image(project.path / RENDER, *as_viewed(light, seen, aim), encoding, WIDE, made)
     discard(project.path / WAVE)  # of an earlier lens
     if evaluated.waves is not None:
-        write_image(project.path / WAVE, evaluated.waves, white_level(evaluated.waves, target), encoding, WIDE)
+        write_image(project.path / WAVE, *as_viewed(light, evaluated.waves, target), encoding, WIDE)
     discard(project.path / FARTHER)
     if evaluated.farther is not None:
         write_image(project.path / FARTHER, evaluated.farther[0], white_level(*evaluated.farther), encoding, WIDE)

@@ -17,10 +17,10 @@ from PIL import Image, ImageDraw, ImageFont
 from caustic_cli.inverse.designer import State
 from caustic_cli.io.picture import codes_of
 from caustic_cli.loading import OnDemand
-from caustic_cli.scene import Screen
+from caustic_cli.scene import Light, Scene
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.studies.retrace import white_level
+from caustic_cli.studies.retrace import as_viewed
 from caustic_cli.workflow.reporter import Reporter
 
 movies = OnDemand("caustic_cli.io.movie")
@@ -46,8 +46,8 @@ class NoMovie:
 
     recorded = False
 
-    def begin(self, screen: Screen) -> None:
-        """Record images on this screen, by whose pixel areas power is converted to irradiance."""
+    def begin(self, scene: Scene) -> None:
+        """Record images on the screen of this scene, and in its light."""
 
     def record(self, state: State, target: np.ndarray, encoding: str, waves: bool) -> None:
         """Record the image of the last iteration; waves: whether it is a wave image."""
@@ -85,10 +85,10 @@ class Movie(NoMovie):
         self._target: np.ndarray | None = None
         self._encoding = "srgb"
         self._last = ""
-        self.screen: Screen | None = None
+        self.scene: Scene | None = None
 
-    def begin(self, screen: Screen) -> None:
-        self.screen = screen
+    def begin(self, scene: Scene) -> None:
+        self.scene = scene
 
     def record(self, state: State, target: np.ndarray, encoding: str, waves: bool) -> None:
         self._target, self._encoding, self._seen = target, encoding, self._seen + 1
@@ -125,10 +125,11 @@ class Movie(NoMovie):
         return relative_rms(grey, goal)
 
     def _add(self, image: np.ndarray, *words: str) -> None:
-        target = self._target
-        if self.screen is not None:
-            image, target = irradiance(image, self.screen), None if target is None else irradiance(target, self.screen)
-        self.frames.append(Frame(codes_of(image, white_level(image, target), self._encoding), (words[0], words[1])))
+        target, light = self._target, Light()
+        if self.scene is not None:
+            screen, light = self.scene.screen, self.scene.light
+            image, target = irradiance(image, screen), None if target is None else irradiance(target, screen)
+        self.frames.append(Frame(codes_of(*as_viewed(light, image, target), self._encoding), (words[0], words[1])))
 
 
 def recorder(path: Path | None, force: bool) -> NoMovie:

@@ -8,7 +8,7 @@ from typing import Any
 from caustic_cli.io.picture import said_of, write_image
 from caustic_cli.project.uptodate import image_provenance
 from caustic_cli.studies.irradiance import irradiance
-from caustic_cli.studies.retrace import white_level
+from caustic_cli.studies.retrace import as_viewed
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
 #: Ratio of the noise of an existing image to that of a new one below which the existing one is kept.
@@ -37,5 +37,5 @@ class RayPicture(Output):
             return {"image_kept": True}
         shown = irradiance(rendering.image, lens.scene.screen)
         aim = None if lens.target is None else irradiance(lens.target, lens.scene.screen)
-        write_image(place.image, shown, white_level(shown, aim), lens.encoding, place.wide, own)
+        write_image(place.image, *as_viewed(lens.scene.light, shown, aim), lens.encoding, place.wide, own)
         return {}

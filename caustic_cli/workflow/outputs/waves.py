@@ -10,7 +10,7 @@ from caustic_cli.io.picture import write_image
 from caustic_cli.optics.plan import parse_effects
 from caustic_cli.project.project import WAVE, beside
 from caustic_cli.studies.metrics import judged
-from caustic_cli.studies.retrace import white_level
+from caustic_cli.studies.retrace import as_viewed
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
 
@@ -33,7 +33,7 @@ class WavePicture(Output):
                 effects=rendering.plan, required=effects != "auto", device=rendering.device, cut=rendering.cut
             )
         if image.size:
-            write_image(path, image, white_level(image, lens.target), lens.encoding, place.wide)
+            write_image(path, *as_viewed(lens.scene.light, image, lens.target), lens.encoding, place.wide)
             rendering.waves = image
             figures = figures | {"wave_image": str(path)}
         return judged(rendering.figures | figures, lens.by_waves or "diffraction" in (parse_effects(effects) or ()))
