@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from oracle import colour_science
 from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.designer import State
 from caustic_cli.io.colorimetry import D65, XYZ_OF_RGB, mean_color_difference, mixture
 from caustic_cli.io.picture import codes_of, read_picture, write_image
 from caustic_cli.project import colours
@@ -21,6 +23,7 @@ from caustic_cli.scene.spectrum import primaries
 from caustic_cli.studies.color_error import color_figures, shown
 from caustic_cli.studies.retrace import as_viewed
 from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow.movie import Movie
 
 LASERS = (638.0, 520.0, 450.0)
 #: Three wavelengths that mix no white.
@@ -126,6 +129,16 @@ def test_a_perfect_image_is_the_picture(codes, picture, tmp_path, wavelengths, e
     )
 
 
+def test_a_movie_shows_the_colours(codes, picture, tmp_path):
+    light = Light(wavelengths=RGB, color=True)
+    target = colours.powers(picture, light)
+    movie = Movie(tmp_path / "a.gif")
+    movie.begin(scene_of(light))
+    state = State(stage=0, heights=torch.zeros(2, 2), history=[(1, 0, 0.0, 1.0, 0.0)], image=torch.from_numpy(0.2 * target))
+    movie.record(state, target, "srgb", False)
+    assert np.abs(movie.frames[0].codes.astype(int) - codes).max() <= 1
+
+
 def test_the_colour_error_is_over_the_picture_at_its_luminance(picture):
     """A dark margin does not count, brightness does not, an unlit channel does; by the oracle's formula."""
     colour, light = colour_science(), Light(wavelengths=RGB, color=True)
@@ -155,6 +168,7 @@ def test_weights_follow_from_the_picture(picture, capfd):
     assert colours.filled({"wavelengths": list(LASERS), "weights": []}, picture)["weights"] != own["weights"]
 
 
+@pytest.mark.slow
 def test_a_design_in_colour(picture, capfd):
     """Figures by rays and by waves; interrupted and resumed gives the same; a render goes by its own wavelengths and weights."""
     figures = run(capfd, "design", "rgb.png", "--color", *TINY, "--iterations", "4", "-o", "whole.caustic")
@@ -170,6 +184,8 @@ def test_a_design_in_colour(picture, capfd):
     def render(*light: str) -> dict:
         return run(capfd, "render", whole, "--rays", "20000", *light, "-o", "out.png", "--force", "--quiet")
 
+    assert cli.run(["render", str(whole), "--rays", "20000", "-o", "out.png", "--quiet"]) == 0
+    assert "mean CIEDE2000" in capfd.readouterr().out
     own = render()
     assert 0.0 < own["wave_ciede2000"] < 60.0
     with Image.open("out.png") as rays, Image.open("out-wave.png") as waves:
