@@ -11,7 +11,7 @@ import torch
 from oracle import colour_science
 from PIL import Image
 
-from caustic_cli import cli
+from caustic_cli import cli, load
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
 from caustic_cli.io.colorimetry import D65, XYZ_OF_RGB, mean_color_difference, mixture
@@ -196,10 +196,12 @@ def test_a_design_in_colour(picture, capfd):
 
 
 def test_a_project_without_weights_opens(picture, capfd):
-    """As written by hand: they follow from the picture."""
+    """As written by hand: they follow from the picture, as for other wavelengths from the library."""
     run(capfd, "design", "rgb.png", "--color", *TINY, "--iterations", "1")
     path = Path("rgb.caustic/project.toml")
     before = workflow.Project.open("rgb.caustic").scene().light
+    other = load("rgb.caustic", wavelengths=list(LASERS)).scene.light
+    assert list(other.weights) == colours.filled({"wavelengths": list(LASERS)}, picture)["weights"]
     path.write_text(re.sub(r"(?ms)^weights = \[.*?\][^\n]*\n", "", path.read_text()))
     assert "weights" not in path.read_text()
     assert workflow.Project.open("rgb.caustic").scene().light == before

@@ -296,10 +296,12 @@ class Project:
 
 
 def _other_source(source: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The [source] section with other keys: a changed source replaces all further ones, and another type has another file."""
+    """The [source] section with other keys: a changed source replaces all further ones, another type has another file, and weights
+    are those of their own wavelengths."""
     gone = {"also"} if given.keys() - {"polarisation"} else set()
     type = given.get("type", source["type"])
     gone |= {"file"} if type != source["type"] else set()
+    gone |= {"weights"} if "wavelengths" in given else set()
     gone |= set() if type in sources.used_by("profile") else {"profile"}
     return {key: value for key, value in source.items() if key not in gone} | dict(given)
 
