@@ -286,6 +286,8 @@ def _wavelengths(figures: dict) -> str:
     values, spectrum, beside = figures["wave_wavelengths"], figures.get("wave_spectrum"), figures.get("wave_unseen_relative_rms")
     at = f"{values[0]:.4g} nm" if len(values) == 1 else f"{len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
     if spectrum is not None:
+        rest = figures.get("wave_spectral_error")
+        at += "" if rest is None else f", whose number leaves an error of {rest:.1g}"
         return f"at {at}, of the spectrum {spectrum} by {'the eye' if figures['wave_detector'] == 'eye' else 'power'}"
     return f"at {at}" if beside is None else f"at {at}, those of the design; {beside:.4f} at wavelengths 1 % beside"
 
@@ -319,6 +321,7 @@ def _of_image(figures: dict, prefix: str) -> list[tuple[str, str]]:
     rows = [
         ("PSNR", _number(figures, f"{prefix}psnr_db", ".2f") + " dB"),
         ("SSIM", _number(figures, f"{prefix}ssim", ".4f")),
+        *([("mean CIEDE2000", _number(figures, f"{prefix}ciede2000", ".2f"))] if f"{prefix}ciede2000" in figures else []),
         ("light on the screen", _number(figures, f"{prefix}on_screen", ".2%") + of),
         ("light on the picture", _number(figures, f"{prefix}on_target", ".2%")),
     ]
@@ -380,6 +383,8 @@ def _wave_image(figures: dict) -> list[tuple[str, str]]:
     if figures["wave_relative_rms"] is None:  # an archive has no target picture
         return [("wave image", f"on the screen {_number(figures, 'wave_on_screen', '.2%')}, {at}")]
     words = f"relative RMS error {_number(figures, 'wave_relative_rms', '.4f')}, {at}"
+    if "wave_ciede2000" in figures:
+        words += f"; mean CIEDE2000 {_number(figures, 'wave_ciede2000', '.2f')}"
     words += f"; on the picture {_number(figures, 'wave_on_target', '.2%')}"
     if figures.get("wave_in_black") is not None:
         words += f", in black {_number(figures, 'wave_in_black', '.2%')}"

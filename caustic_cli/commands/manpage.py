@@ -85,6 +85,11 @@ rays (relative_rms).
 Comparison of ray image and target, with rays counted in pixels: the loss of eq. 5.2.1 of the thesis; that loss times the number of
 pixels, which is the RMS error divided by the mean; peak signal\-to\-noise ratio; structural similarity.
 .TP
+.B ciede2000, wave_ciede2000
+For a coloured picture: mean CIEDE2000 colour difference between ray image, or wave image, and picture, over the smallest rectangle
+that holds all light of the picture, at the picture's total luminance and with its white (sRGB 255,255,255).  The noise of the rays
+adds to it.
+.TP
 .B in_black
 Fraction of the light on the screen that lands where the target is below a hundredth of its peak, a dark margin included; null
 for a target without such pixels.

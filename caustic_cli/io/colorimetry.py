@@ -27,6 +27,8 @@ D65_XY = (0.3127, 0.3290)
 BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 #: CIELAB's cube root is continued by a line below DELTA^3.
 DELTA = 6.0 / 29.0
+#: Negative part of the largest of three powers that counts as rounding.
+ROUNDING = 1e-9
 
 
 def _xyz_of(x: float, y: float) -> np.ndarray:
@@ -80,6 +82,30 @@ def srgb_to_xyz(codes: np.ndarray, white: Sequence[float] | np.ndarray = tuple(D
     values = codes / np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else codes
     matrix = adaptation(D65, white) @ XYZ_OF_RGB
     return np.moveaxis(np.moveaxis(to_linear(values), axis, -1) @ matrix.T, -1, axis)
+
+
+def mixture(rgb: np.ndarray, primaries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Powers of three lights that together look like a picture: those that have its X, Y, Z.
+
+    A colour that they cannot mix, of which one power would be negative, is moved towards the grey of its own luminance as far as
+    necessary; towards the mixture of equal luminances where the lights cannot mix the grey of D65 itself.
+
+    Args:
+        rgb: (3, ...) linear R, G, B.
+        primaries: (3, 3) X, Y, Z of a unit of power of each light, in columns.
+
+    Returns:
+        (3, ...) powers, not negative, and the mask (...) of the pixels that were moved.
+    """
+    luminance = primaries[1]
+    neutral = np.linalg.solve(primaries, D65)
+    if not (neutral > 0).all():
+        neutral = 1.0 / (3.0 * luminance)
+    powers = np.tensordot(np.linalg.solve(primaries, XYZ_OF_RGB), rgb, 1)
+    grey = np.multiply.outer(neutral, np.tensordot(luminance, powers, 1))
+    negative = powers < -ROUNDING * powers.max(0)
+    way = np.divide(powers, powers - grey, out=np.zeros_like(powers), where=negative).max(0)
+    return np.maximum(powers + way * (grey - powers), 0.0), negative.any(0)
 
 
 def xyz_to_lab(xyz: np.ndarray, white: Sequence[float] | np.ndarray, axis: int = -1) -> np.ndarray:

@@ -73,9 +73,10 @@ class Picture:
         return self.values.shape[-2:] if self.values.dtype == np.float64 else self.values.shape[1::-1]
 
     def irradiance(self) -> np.ndarray:
-        """Linear irradiance (a, b), [i, j], or (3, a, b) in colour, float64; codes are scaled to [0, 1]."""
+        """Linear irradiance (a, b), [i, j], float64, or linear R, G, B (3, a, b) in colour; codes are scaled to [0, 1], of which 1
+        is white, and so are colours in floating point."""
         if self.values.dtype == np.float64:
-            return self.values
+            return self.values if self.values.ndim == 2 else self.values / (self.values.max() or 1.0)
         top = np.iinfo(self.values.dtype).max
         table = np.arange(top + 1) / top
         if self.encoding == "srgb":

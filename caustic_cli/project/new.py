@@ -14,7 +14,7 @@ from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.optics.obstruction import clear_shift
-from caustic_cli.project import attachments, uptodate
+from caustic_cli.project import attachments, colours, uptodate
 from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.schema.table import Parameters, TargetSettings
@@ -52,8 +52,7 @@ def new_project(
     if goal.color:
         if isinstance(target, Picture):
             raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
-        light = [float(c) for c in picture.irradiance().sum((1, 2))]
-        said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
+        said["source"] = colours.filled(said.get("source", {}), picture)
     full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
     for key in ("index_range", "index_control", "index_layers"):
         if f"lens.{key}" in given and full.lens.gradient != "free":
@@ -63,6 +62,8 @@ def new_project(
         full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
         say(f"the screen is shifted by {shift[0]:g},{shift[1]:g} mm, beside the light of its source; ⟨+screen.shift⟩ places it")
     settings.refuse_unused(full.source, given, [stage.source for stage in full.design.stages])
+    if goal.color and (beyond := colours.beyond_words(picture, settings.build_light(full))):
+        say(beyond)
     full = full.changed(target=full.target.changed(file=f"target{picture.suffix}", encoding=picture.encoding))
     full = attachments.named_in_project(full)
     asked = uptodate.digest(full, picture)

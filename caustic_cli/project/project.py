@@ -29,7 +29,7 @@ from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
-from caustic_cli.project import attachments, checkpoint
+from caustic_cli.project import attachments, checkpoint, colours
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.completion import complete, complete_source
 from caustic_cli.scene import Scene, sources
@@ -116,6 +116,8 @@ class Project:
             for file in (name, *(table[row.key] for table, row in attachments.names_in(given))):
                 _within(file)
             picture = read_picture(path / name, goal.encoding == "linear", goal.color)
+            if goal.color:
+                given["source"] = colours.filled(given.get("source", {}), picture)
             full = complete(attachments.attached(attachments.located(given, path)), picture.aspect)
             build_stages(full), build_options(full)  # validates the design, too
             return cls(path, full, picture, on_disk=True)
@@ -166,16 +168,19 @@ class Project:
         other = _other_source(s.source, own.get("source", {}))
         settings.refuse_unused(other, given)
         # Further conditions of a design on its source do not apply to an image.
+        if s.target.color:
+            other = colours.filled(other, self.picture)
         source = complete_source(SourceSettings.of(other), s.lens)
         lens, screen = s.lens.changed(**own.get("lens", {})), s.screen.changed(**own.get("screen", {}))
         return settings.build_scene(s.changed(source=source, lens=lens, screen=screen))
 
     def target(self, scene: Scene) -> np.ndarray:
-        """The target on the screen of the scene, (n_x, n_y), or (3, n_x, n_y) in colour."""
+        """The target on the screen of the scene, (n_x, n_y), or (3, n_x, n_y) in colour, the power of each wavelength."""
         t, light = self.settings.target, self.picture.irradiance()
         if t.sheet:
             return np.mean([own / own.sum() for own in self.targets(scene)], axis=0)
-        if light.ndim == 3:
+        if t.color:
+            light = colours.powers(self.picture, scene.light)
             whole = target_on_screen(light.sum(0), t.size, scene.screen, t.flip)
             parts = [target_on_screen(c, t.size, scene.screen, t.flip) if c.any() else 0.0 * whole for c in light]
             return np.stack(parts)
@@ -291,10 +296,12 @@ class Project:
 
 
 def _other_source(source: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The [source] section with other keys: a changed source replaces all further ones, and another type has another file."""
+    """The [source] section with other keys: a changed source replaces all further ones, another type has another file, and weights
+    are those of their own wavelengths."""
     gone = {"also"} if given.keys() - {"polarisation"} else set()
     type = given.get("type", source["type"])
     gone |= {"file"} if type != source["type"] else set()
+    gone |= {"weights"} if "wavelengths" in given else set()
     gone |= set() if type in sources.used_by("profile") else {"profile"}
     return {key: value for key, value in source.items() if key not in gone} | dict(given)
 

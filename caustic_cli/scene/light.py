@@ -23,8 +23,8 @@ RGB = (611.4, 549.1, 464.3)
 #: Largest number of wavelengths of one source: each takes a trace.
 MAX_WAVELENGTHS = 99
 #: Wavelengths that represent a continuous spectrum: as traced through a dispersive glass, and in the verdict on a wave image, where
-#: an even number lies between the odd one that most designs have.
-RAY_NODES, WAVE_NODES = 5, 10
+#: they are others than those of any design and give the error of 51 within 0.7 % (`tests/benchmarks/wavelengths.py`).
+RAY_NODES, WAVE_NODES = 5, 12
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Light:
     weights: tuple[float, ...] = ()
     #: Unpolarised light is traced as two orthogonal polarisations, since the entrance transmits s and p differently.
     tracked: bool = False
-    #: The wavelengths are red, green and blue, and the image has a channel for each.
+    #: The wavelengths are red, green and blue, and the image has a channel for each, the power of its light.
     color: bool = False
     #: Unit of the source's power: W (radiant flux) or lm (luminous flux).
     unit: str = "W"
@@ -71,11 +71,18 @@ class Light:
             raise InputError(
                 f"⟨source.wavelengths⟩ of a coloured picture are three, red, green and blue, got {len(self.wavelengths)}"
             )
+        if self.color:
+            self.primaries  # noqa: B018 - refuses wavelengths that mix no colours
 
     @property
     def effects(self) -> frozenset[str]:
         """Names of the effects on rays that it causes."""
         return frozenset(() if self.polarisation is None else {"polarisation"})
+
+    @cached_property
+    def primaries(self) -> np.ndarray:
+        """X, Y, Z of a unit of power in each colour channel, as the columns of a matrix, see `spectrum.primaries`."""
+        return spectra.primaries(self.wavelengths)
 
     @property
     def channels(self) -> tuple[int | None, ...]:

@@ -16,7 +16,7 @@ Gauss rule, whose nodes crowd where there is little light, needs 17 for 1 %.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -53,6 +53,8 @@ WAVELENGTHS = (100.0, 20_000.0)
 INVISIBLE = 0.01
 #: Most wavelengths of a rule.
 MOST_NODES = 128
+#: Least area of the triangle of three wavelengths in the chromaticity diagram, doubled, for which they mix colours; sRGB has 0.22.
+LEAST_GAMUT = 0.01
 #: Share of the light at either end of a spectrum that takes no wavelength of its own.
 TAIL = 0.01
 #: Least width of a range, nm.
@@ -133,6 +135,21 @@ def tristimulus(wavelengths: np.ndarray) -> np.ndarray:
     of the table, 360 to 830 nm in steps of 1 nm, 0 outside."""
     at, *columns = _table("observer").T
     return np.stack([np.interp(wavelengths, at, c, 0.0, 0.0) for c in columns], axis=-1)
+
+
+def primaries(wavelengths: Sequence[float]) -> np.ndarray:
+    """X, Y, Z of a unit of power at each of three wavelengths, nm, as the columns of a matrix (3, 3), without the factor K_m.
+
+    Raises:
+        InputError: their chromaticities are nearly on a line, or the eye sees one of them not at all, so that they mix no picture.
+    """
+    found = tristimulus(np.asarray(wavelengths, dtype=float)).T
+    with np.errstate(invalid="ignore"):
+        gamut = abs(float(np.linalg.det(found / found.sum(0))))
+    if not gamut >= LEAST_GAMUT:
+        said = ", ".join(f"{w:g}" for w in wavelengths)
+        raise InputError(f"⟨source.wavelengths⟩ {said} nm mix too few colours for a picture: a red, a green and a blue are needed")
+    return found
 
 
 def luminous_efficiency(wavelengths: np.ndarray) -> np.ndarray:

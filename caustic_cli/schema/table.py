@@ -243,7 +243,8 @@ class SourceSettings(Section):
     wavelengths: Numbers | None = setting("wavelengths of the source's spectrum; a glass has its own index at each", "nm",
             *WAVELENGTHS, derived="one wavelength", option=Option("--wavelengths", "NM[:W],...", BOTH),
             speaks_for=("source.weights",))
-    weights: Numbers | None = setting("relative power at each wavelength", low=0.0, high=checks.POWER, derived="equal")
+    weights: Numbers | None = setting("relative power at each wavelength", low=0.0, high=checks.POWER,
+            derived="equal; of a coloured picture, those that give its colours")
     spectrum: str | None = setting("continuous spectrum: equal (energy), daylight (D65), sun (AM1.5), led-3000, led-4000, led-6500,"
             " halogen, or a .csv of nm and relative power per nm; wavelengths are then samples of it", derived="equal, for waves"
             " where no wavelengths are given", option=Option("--spectrum", "NAME|FILE.csv", BOTH), file="spectrum")
@@ -347,8 +348,8 @@ class TargetSettings(Section):
             choices=("", "x", "y", "xy"), default="", option=Option("--flip", "x|y|xy"))
     sheet: bool = setting("the picture is a contact sheet with a separate picture for each lenslet of an array", default=False,
             written=False, option=Option("--sheet"))
-    color: bool = setting("three colour channels (611, 549, 464 nm), with the glass' index for each", default=False, written=False,
-            option=Option("--color"))
+    color: bool = setting("the picture in colour: light of three wavelengths (611, 549, 464 nm), with the glass' index for each,"
+            " that looks like its sRGB colours (CIE 1931)", default=False, written=False, option=Option("--color"))
 
 
 class SecondSettings(Section):

@@ -151,6 +151,8 @@ def _images(image: np.ndarray, waves: np.ndarray | None, figures: dict, colours:
     def absolute(picture: np.ndarray, title: str, prefix: str, colours: Colours | None) -> Shown:
         error, scale = figures[f"{prefix}relative_rms"], figures[f"{prefix}peak_irradiance"] / (picture.max() or 1.0)
         words = title if error is None else f"{title}\nrelative RMS error {error:.3f}"
+        if figures.get(f"{prefix}ciede2000") is not None:
+            words += f", CIEDE2000 {figures[f'{prefix}ciede2000']:.1f}"
         if colours is None or not scale > 0:
             return Shown(picture * scale, words, prefix)
         return Shown(picture * scale, words, prefix, lambda white: colours(white / scale) / (white / scale))

@@ -21,6 +21,7 @@ from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
+from caustic_cli.studies.color_error import color_figures
 from caustic_cli.studies.irradiance import irradiance_figures, source_figures, unit_figures
 from caustic_cli.studies.metrics import figures_of_merit
 from caustic_cli.studies.noise import black_error, image_noise, noise_bias, standard_error, variance_of
@@ -179,8 +180,8 @@ def retrace(
     Returns:
         the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by bincount,
         with the rays that were traced; noise, of relative_rms, None without a target; in_black_noise, of in_black, None without
-        that; error_estimate, the relative RMS noise of the image, None of a black one; those of `studies.irradiance`; with
-        `tolerance` also rays_traced.
+        that; error_estimate, the relative RMS noise of the image, None of a black one; those of `studies.irradiance` and of
+        `studies.color_error`, which is not corrected for noise; with `tolerance` also rays_traced.
     """
 
     def trace(name: str, count: int, light: Scene = scene) -> Image:
@@ -201,6 +202,7 @@ def retrace(
         counted, figures = _in_halves(trace, scene, target, rays, quiet)
     require_energy_balance(counted, dtype)
     figures |= irradiance_figures(scene, counted.image) | unit_figures(scene) | source_figures(scene, figures["on_target"])
+    figures |= color_figures(scene, counted.image, target)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     sampler = sampler_for(scene, counted.rays, seed, device)

@@ -9,6 +9,7 @@ import numpy as np
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.image import Image
 from caustic_cli.scene import Scene
+from caustic_cli.studies.color_error import shown
 from caustic_cli.studies.retrace import white_level
 
 if TYPE_CHECKING:
@@ -27,14 +28,14 @@ def tristimulus_values(scene: Scene, found: Image | WaveImage) -> np.ndarray | N
 
 
 def as_viewed(
-    scene: Scene, image: np.ndarray, target: np.ndarray | None, xyz: np.ndarray | None = None
+    scene: Scene | None, image: np.ndarray, target: np.ndarray | None, xyz: np.ndarray | None = None
 ) -> tuple[np.ndarray, float]:
-    """What is shown of an image of irradiance, and the value of white in it, for the exposure of the target.
-
-    xyz: tristimulus values, for linear R, G, B of sRGB (3, n_x, n_y) in which the light of the source is grey; the image without.
-    """
+    """What is shown of an image of irradiance, and the value of white in it, at the exposure of the target: a coloured picture's
+    channels, and tristimulus values `xyz`, as linear R, G, B of sRGB (3, n_x, n_y); without these the image itself."""
+    if scene is not None and scene.colored:
+        return shown(scene.light, image, target), 1.0
     white = white_level(image, target)
-    return (image if xyz is None else in_colour(scene, xyz, white)), white
+    return (image if xyz is None or scene is None else in_colour(scene, xyz, white)), white
 
 
 def in_colour(scene: Scene, xyz: np.ndarray, white: float) -> np.ndarray:

@@ -16,6 +16,7 @@ from caustic_cli.optics.waves.image import UNASKED, Perturbation, WaveImage, wav
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.materials import material
+from caustic_cli.studies.color_error import color_figures
 from caustic_cli.studies.irradiance import irradiance_figures
 from caustic_cli.studies.metrics import figures_of_merit
 
@@ -45,10 +46,11 @@ def wave_figures(
     Returns:
         the image, None if it is not available and `required` is false; and wave_relative_rms, wave_psnr_db, wave_ssim,
         wave_on_target, wave_in_black (None without a target), wave_on_screen, wave_wavelengths (nm), wave_spectrum and
-        wave_detector, of the continuous spectrum that these represent, None for spectral lines, resolvable, the number of
+        wave_detector, of the continuous spectrum that these represent, None for spectral lines, wave_spectral_error, the error of
+        wave_relative_rms that follows from their number, None where that is unknown, resolvable, the number of
         resolvable details across the picture, wave_source_points, the points that the source was taken as, wave_source_error, by
-        how much an extended source's light is misplaced so, mm, and wave_peak_irradiance and wave_mean_irradiance, as of a ray
-        image.
+        how much an extended source's light is misplaced so, mm, and wave_peak_irradiance, wave_mean_irradiance and, in colour,
+        wave_ciede2000, as of a ray image.
     """
     most = math.inf if required else UNASKED
     try:
@@ -65,16 +67,17 @@ def wave_figures(
             )
         ) | {"wave_wavelengths": [], "resolvable": seen.resolvable, "no_wave_image": str(error)}
     of, whole = _judged(found, target), scene.light.continuum
-    absolute = {f"wave_{name}": value for name, value in irradiance_figures(scene, found.image).items()}
+    further = irradiance_figures(scene, found.image) | color_figures(scene, found.image, target)
     return found, {
         **{f"wave_{name}": of[name] for name in _SAME},
         "wave_wavelengths": list(found.wavelengths),
         "wave_spectrum": None if whole is None else whole.spectrum.name,
         "wave_detector": None if whole is None else whole.detector,
+        "wave_spectral_error": _spectral_error(found, of["relative_rms"], target),
         "resolvable": seen.resolvable,
         "wave_source_points": found.points,
         "wave_source_error": found.spread_error,
-    } | absolute
+    } | {f"wave_{name}": value for name, value in further.items()}
 
 
 def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray) -> dict:
@@ -107,6 +110,18 @@ def height_deviation(surface: MeasuredSurface, field: HeightField, heights: Tens
         return surface.at(None, x, y, [(0, 0)])[0] - field.at(heights, x, y, [(0, 0)])[0]
 
     return higher
+
+
+def _spectral_error(found: WaveImage, error: float | None, target: np.ndarray | None) -> float | None:
+    """Estimated error of a relative RMS of the wave image that follows from the number of its wavelengths.
+
+    These are the midpoints of parts of the spectrum, a rule of second order: with half as many the error is four times as large, so
+    that it is a third of the difference (Richardson).  Of two such halves, every second wavelength each, the mean is taken.
+    """
+    if found.halves is None or target is None or error is None:
+        return None
+    halves = [_judged(replace(found, image=half), target)["relative_rms"] for half in found.halves]
+    return abs(math.fsum(halves) / 2.0 - error) / 3.0
 
 
 def _judged(found: WaveImage, target: np.ndarray | None) -> dict:

@@ -55,8 +55,9 @@ Perturbation = Callable[[Tensor, Tensor], Tensor]
 @dataclass(frozen=True)
 class Line:
     """One spectral line: wavelength, nm; fraction of the power; the system at this wavelength; label, the wavelength at which media
-    are evaluated (None if the system has the indices already); the channel of a coloured image; and the colour of the light that it
-    represents, as of `scene.Band`."""
+    are evaluated (None if the system has the indices already); the channel of a coloured image; the colour of the light that it
+    represents, as of `scene.Band`; and of a continuous spectrum the half of its wavelengths that it belongs to, of which every
+    second one is in the other."""
 
     wavelength: float
     part: float
@@ -64,6 +65,7 @@ class Line:
     label: float | None = None
     channel: int | None = None
     colour: tuple[float, float, float] | None = None
+    half: int | None = None
 
     @property
     def length(self) -> float:
@@ -82,7 +84,8 @@ class WaveImage:
 
     image: float64, differentiable if the heights were; leaving: power behind the system; off_screen: power outside the pixels;
     wavelengths: nm; points: number of source points; spread_error: displacement error of the point-spread approximation, mm;
-    samples: of the largest transform along each axis; xyz: tristimulus values, as of `optics.image.Image`.
+    samples: of the largest transform along each axis; xyz: tristimulus values, as of `optics.image.Image`; halves: the images of
+    either half of the wavelengths that represent a continuous spectrum, of which it is the sum; None for spectral lines.
     """
 
     image: Tensor
@@ -93,6 +96,7 @@ class WaveImage:
     spread_error: float
     samples: tuple[int, int]
     xyz: Tensor | None = None
+    halves: tuple[Tensor, Tensor] | None = None
 
 
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
@@ -106,10 +110,12 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
             for line in lines_of(one, field, wavelengths)
         ]
     found, systems = [], {}
+    continuous = scene.light.continuum is not None
     given, parts = scene.light.lines(wavelengths or ())
     channels = scene.light.channels if given is scene.light.wavelengths else (None,) * len(given)
     states = (0.0, 90.0) if scene.light.tracked and scene.light.polarisation is None else (scene.light.polarisation,)
-    for wavelength, part, channel, colour in zip(given, parts, channels, scene.light.colours_of(given), strict=True):
+    of_each = zip(given, parts, channels, scene.light.colours_of(given), strict=True)
+    for k, (wavelength, part, channel, colour) in enumerate(of_each):
         lens = replace(scene.lens, roughness=0.0)
         if (glass := lens.interior.glass) is not None:
             lens = replace(lens, index=nearest_index(glass, wavelength))
@@ -117,7 +123,11 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
             if (lens.index, state) not in systems:  # light of one index and polarisation takes the same paths
                 one = replace(scene, lens=lens, light=Light(state))
                 systems[lens.index, state] = System.of(one, field)
-            found.append(Line(wavelength, part / len(states), systems[lens.index, state], None, channel, colour))
+            found.append(
+                Line(
+                    wavelength, part / len(states), systems[lens.index, state], None, channel, colour, k % 2 if continuous else None
+                )
+            )
     return found
 
 
@@ -197,8 +207,17 @@ def image_of(
             max(w.spread_error for w in found),
             max(w.samples for w in found),
             cast(Tensor, sum(w.xyz for w in found)) if all(w.xyz is not None for w in found) else None,
+            _summed([w.halves for w in found]),
         )
     )
+
+
+def _summed(pairs: list[tuple[Tensor, Tensor] | None]) -> tuple[Tensor, Tensor] | None:
+    """The sum of pairs of images; None if one is missing."""
+    known = [pair for pair in pairs if pair is not None]
+    if len(known) < len(pairs):
+        return None
+    return cast(Tensor, sum(a for a, _ in known)), cast(Tensor, sum(b for _, b in known))
 
 
 def _alike(lines: list[Line]) -> list[list[Line]]:
@@ -303,7 +322,7 @@ class Imager:
         """The wave image of these lines, at heights {name: (n, m) mm} close to those for which the sampling was chosen."""
         colours = [line.channel for line in lines if line.channel is not None]
         images: dict[int | None, Tensor] = {}
-        leaving, xyz = 0.0, None
+        leaving, xyz, halves = 0.0, None, dict[int, Tensor]()
         for group in _alike(lines):
             for k, mode in enumerate(self.modes(group[0].system)):
                 front = self.front(group[0], mode, parameters)
@@ -312,6 +331,8 @@ class Imager:
                     images[line.channel] = images.get(line.channel, 0.0) + line.part * part
                     leaving += line.part * power
                     xyz = with_colour(xyz, line.part * part, line.colour)
+                    if line.half is not None:
+                        halves[line.half] = halves.get(line.half, 0.0) + line.part * part.detach()
         some = next(iter(images.values()))
         image = torch.stack([images.get(k, torch.zeros_like(some)) for k in range(3)]) if colours else some
         return WaveImage(
@@ -323,6 +344,7 @@ class Imager:
             self.spread.error / math.sqrt(max(1, self.each)),
             self.sampling.padded,
             xyz,
+            (halves[0], halves[1]) if len(halves) == 2 else None,
         )
 
     def modes(self, system: System) -> list[Mode]:
