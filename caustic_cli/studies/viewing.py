@@ -20,11 +20,14 @@ colorimetry = OnDemand("caustic_cli.io.colorimetry")
 
 def tristimulus_values(scene: Scene, found: Image | WaveImage) -> np.ndarray | None:
     """X, Y, Z of an image (3, n_x, n_y), float64, Y that of the image; None for light without colour (`Scene.white`)."""
-    if scene.white is None:
-        return None
-    if found.xyz is None:  # light of the same colour everywhere
-        return np.array(scene.white)[:, None, None] * found.image.cpu().numpy()
-    return found.xyz.cpu().numpy()
+    return separated(scene, (found.image if found.xyz is None else found.xyz).cpu().numpy())[1]  # of one colour, or of several
+
+
+def separated(scene: Scene | None, image: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """An image and its tristimulus values, None for light without colour, of either of them."""
+    if scene is None or scene.white is None:
+        return image, None
+    return (image, np.array(scene.white)[:, None, None] * image) if image.ndim == 2 else (image[1], image)
 
 
 def as_viewed(

@@ -21,7 +21,7 @@ from caustic_cli.loading import OnDemand
 from caustic_cli.scene import Scene
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.studies.viewing import as_viewed
+from caustic_cli.studies.viewing import as_viewed, separated
 from caustic_cli.workflow.reporter import Reporter
 
 movies = OnDemand("caustic_cli.io.movie")
@@ -122,19 +122,13 @@ class Movie(NoMovie):
 
     def _error(self, image: np.ndarray) -> float:
         assert self._target is not None
-        return relative_rms(grey(self._luminous(image)), grey(self._target))
-
-    def _luminous(self, image: np.ndarray) -> np.ndarray:
-        """Y of tristimulus values; another image as it is."""
-        return image if self.scene is None or self.scene.white is None or image.ndim == 2 else image[1]
+        return relative_rms(grey(separated(self.scene, image)[0]), grey(self._target))
 
     def _add(self, image: np.ndarray, *words: str) -> None:
         target, scene = self._target, self.scene
         if scene is not None:
             image, target = irradiance(image, scene.screen), None if target is None else irradiance(target, scene.screen)
-        seen, xyz = self._luminous(image), None
-        if scene is not None and scene.white is not None:
-            xyz = image if image.ndim == 3 else np.array(scene.white)[:, None, None] * image
+        seen, xyz = separated(scene, image)
         self.frames.append(Frame(codes_of(*as_viewed(scene, seen, target, xyz), self._encoding), (words[0], words[1])))
 
 
