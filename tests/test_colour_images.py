@@ -22,7 +22,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import lines_of, wave_image
 from caustic_cli.scene import Lens, Light, Points, Scene, Screen
-from caustic_cli.scene.sources.several import Several, light_of_all
+from caustic_cli.scene.sources.several import light_of_all, together
 from caustic_cli.scene.spectrum import BUILT_IN, measure_of, tristimulus, white_point
 from caustic_cli.studies.design_report import write_report
 from caustic_cli.studies.irradiance import irradiance
@@ -122,11 +122,14 @@ def test_sources_keep_their_own_spectra():
     tables = [{"type": "plane", "power": p, "spectrum": name} for p, name in ((1.0, "halogen"), (3.0, "led-6500"))]
     lights, whole = [light_of_all(one) for one in tables], light_of_all(tables[0] | {"also": tables[1:]})
     members = (Points(((-1.0, 0.0, -40.0),), (1.0,)), Points(((1.0, 0.0, -40.0),), (3.0,)))
-    source = Several(members, tuple((one.wavelengths, one.weights) for one in lights), tuple(one.measure for one in lights))
+    source = together(members, lights)
     lens = Lens((2.0, 2.0), control=(9, 9))
     scene, field = Scene(source, lens, Screen((12.0, 12.0), 60.0, (24, 24)), whole), HeightField.of(lens)
     whites = np.array([one.white for one in lights])
-    assert scene.white == pytest.approx(0.25 * whites[0] + 0.75 * whites[1])
+    lumens = [p * one.efficacy for p, one in zip((1.0, 3.0), lights, strict=True)]
+    parts = np.array(lumens) / sum(lumens)  # of what an eye sees
+    assert scene.white == pytest.approx(parts @ whites) and source.fractions == pytest.approx(parts)
+    assert sum(w for w in whole.weights[5:]) == pytest.approx(lumens[1])
     lines = lines_of(scene, field)
     assert [line.wavelength for line in lines] == [w for one in lights for w in one.lines()[0]]
     assert [line.colour for line in lines] == [c for one in lights for c in one.colours_of(one.lines()[0])]
@@ -135,7 +138,7 @@ def test_sources_keep_their_own_spectra():
     found = expose(scene, field, z, rays)
     assert found.xyz is not None
     alone = [expose(one, field, z, of_member(rays, k)).image for k, one in enumerate(scene.by_source)]
-    wanted = sum(f * torch.tensor(w)[:, None, None] * image for f, w, image in zip((0.25, 0.75), whites, alone, strict=True))
+    wanted = sum(f * torch.tensor(w)[:, None, None] * image for f, w, image in zip(parts, whites, alone, strict=True))
     torch.testing.assert_close(found.xyz, wanted, rtol=0, atol=1e-15)
 
 

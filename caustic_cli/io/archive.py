@@ -27,8 +27,8 @@ from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 from caustic_cli.scene.sources.points import MAX_POINTS
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
-from caustic_cli.scene.sources.several import MOST, Several
-from caustic_cli.scene.spectrum import MOST_ROWS, Measure, Spectrum
+from caustic_cli.scene.sources.several import MOST, Several, together
+from caustic_cli.scene.spectrum import MOST_ROWS, Measure, Spectrum, luminous_efficacy
 from caustic_cli.schema.table import check
 
 #: Keys of a source and of its spectrum.
@@ -191,7 +191,8 @@ def _source(data: Archive, rays: RaySet | None) -> Source:
 def _several(data: Archive, rays: RaySet | None) -> Several:
     """Several sources, of which those that are ray files have these rays."""
     (count,) = data.wholes("source_count", 1)
-    members, spectra, measures, files = [], [], [], 0
+    members, lights, files = [], [], 0
+    unit = data.text("source_power_unit", "W")
     for k in range(1, min(count, MOST) + 1):
         with naming(f"source {k}"):
             one = data.renamed({key: f"source_{k}_{key.removeprefix('source_')}" for key in KEYS})
@@ -199,11 +200,12 @@ def _several(data: Archive, rays: RaySet | None) -> Several:
                 raise InputError("source_type must be that of a single source, got 'several'")
             files += one.text("source_type") == "rays"
             members.append(_source(one, rays if one.text("source_type") == "rays" else None))
-            spectra.append(_spectrum(one))
-            measures.append(_measure(one))
+            measure = _measure(one)
+            efficacy = None if measure is None else luminous_efficacy(measure.spectrum)
+            lights.append(Light(None, *_spectrum(one), unit=unit, measure=measure, efficacy=efficacy))
     if rays is not None and not files:
         raise InputError("⟨source.file⟩ belongs to an archive whose source is a ray file, and none of this one's is")
-    return Several(tuple(members), tuple(spectra), tuple(measures))
+    return together(members, lights)
 
 
 def _measured(data: Archive, rays: RaySet | None) -> Measured:

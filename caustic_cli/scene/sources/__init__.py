@@ -107,9 +107,7 @@ def combined(first: Source, section: Table) -> Source:
     if not section.get("also"):
         return first
     others = (type_of(table["type"], "⟨source.also.type⟩").from_settings(table, None) for table in section["also"])
-    lights = several.lights_of(section)
-    samples = tuple((light.wavelengths, light.weights) for light in lights)
-    return several.Several((first, *others), samples, tuple(light.measure for light in lights))
+    return several.together((first, *others), several.lights_of(section))
 
 
 def __getattr__(name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -38,6 +39,8 @@ class Several(Source):
     spectra: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
     #: The continuous spectrum that these are samples of, of each, or None; empty if no source has one.
     measures: tuple[Measure | None, ...] = ()
+    #: Luminous efficacy of each, lm/W, where the eye sees them and their powers are in W; empty elsewhere.
+    efficacies: tuple[float, ...] = ()
 
     kind = "several"
 
@@ -54,8 +57,9 @@ class Several(Source):
 
     @property
     def fractions(self) -> tuple[float, ...]:
-        """Fraction of the total power of each."""
-        return tuple(member.power / self.power for member in self.members)
+        """Fraction of the total power of each, of luminous power where the eye sees it."""
+        amounts = [m.power * e for m, e in zip(self.members, self.efficacies or (1.0,) * len(self.members), strict=True)]
+        return tuple(amount / math.fsum(amounts) for amount in amounts)
 
     @property
     def collimated(self) -> bool:
@@ -155,6 +159,18 @@ class Several(Source):
         return max(member.incidence(pupil) for member in self.members)
 
 
+def together(members: Sequence[Source], lights: Sequence[Light]) -> Several:
+    """Sources at once, each with its own light."""
+    samples = tuple((light.wavelengths, light.weights) for light in lights)
+    return Several(tuple(members), samples, tuple(light.measure for light in lights), efficacies(lights))
+
+
+def efficacies(lights: Sequence[Light]) -> tuple[float, ...]:
+    """Luminous efficacies, lm/W, of lights that the eye sees and whose power is in W; empty where one is not, or its is unknown."""
+    found = [light.efficacy or 0.0 for light in lights if light.unit == "W" and light.white is not None]
+    return tuple(found) if len(found) == len(lights) and all(found) else ()
+
+
 def lights_of(section: Table, color: bool = False) -> list[Light]:
     """The `Light` of each source of a [source] section: its own wavelengths, with the first's polarisation and unit of power."""
     state, unit = section.get("polarisation"), section.get("power_unit", "W")
@@ -195,8 +211,9 @@ def light_of_all(section: Table, color: bool = False) -> Light:
     if len(lights) == 1:
         return lights[0]
     powers = [table["power"] for table in (section, *section["also"])]
+    amounts = [p * e for p, e in zip(powers, efficacies(lights) or (1.0,) * len(powers), strict=True)]
     wavelengths = tuple(w for light in lights for w in light.wavelengths)
-    weights = tuple(power * fraction for power, light in zip(powers, lights, strict=True) for fraction in light.fractions)
+    weights = tuple(amount * fraction for amount, light in zip(amounts, lights, strict=True) for fraction in light.fractions)
     each = [light.efficacy for light in lights if light.efficacy]
     whole = _together(powers, each, lights[0].unit) if len(each) == len(lights) else None
     return replace(lights[0], wavelengths=wavelengths, weights=weights, efficacy=whole)
