@@ -28,6 +28,8 @@ by_waves = OnDemand("caustic_cli.studies.waves")
 LIKENESS = {"rms", "rms-light", "throughput"}
 #: Ratio of the light on the screen from which a lens is kept although the initial surface has a smaller error.
 BRIGHTER = 1.01
+#: Ratio of the errors by waves from which few wavelengths tell that the initial surface is worse.
+CLEARLY = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,16 +91,28 @@ class LensEvaluation:
             quiet=None if self.timed else self.problem.effort.noise,
         )
 
-    def see(self, heights: Tensor, noise: bool = True) -> Seen:
-        """The same, and by waves if these were refined."""
+    def see(self, heights: Tensor, noise: bool = True, wavelengths: tuple[float, ...] = ()) -> Seen:
+        """The same, and by waves if these were refined; wavelengths: of a continuous spectrum, instead of the verdict's, nm."""
         exposure, figures = self.rays(heights, noise)
         if not self.refined:
             return Seen(exposure, None, figures)
         problem = self.problem
         light, more = by_waves.wave_figures(
-            problem.scene, self.field, heights.to(problem.device), self.target, self.seen, required=problem.options.waves
+            problem.scene,
+            self.field,
+            heights.to(problem.device),
+            self.target,
+            self.seen,
+            wavelengths=wavelengths,
+            required=problem.options.waves,
         )
         return Seen(exposure, light, figures | more)
+
+    @property
+    def few(self) -> tuple[float, ...]:
+        """Wavelengths of the design, nm, which tell an image that is clearly worse; empty where the verdict has no others."""
+        by_waves = [stage.waves for stage in self.designer.stages if stage.waves]
+        return by_waves[-1] if self.light is not None and self.light.halves is not None and by_waves else ()
 
     def compare_with_start(self) -> None:
         """Keep the initial surface if it is better, where the loss measures the error of the picture alone."""
@@ -108,8 +122,10 @@ class LensEvaluation:
             return
         heights = problem.feasible(state.stage, self.designer.initial_surface(state))
         # other light has an estimate of the noise anyway
-        _, light, initial = self.see(heights, noise=not problem.scene.source.collimated or state.unrounded is not None)
-        figures = self.figures
+        noise, figures = not problem.scene.source.collimated or state.unrounded is not None, self.figures
+        _, light, initial = self.see(heights, noise, self.few)
+        if self.few and not (initial["wave_relative_rms"] or 0.0) > CLEARLY * figures["wave_relative_rms"]:
+            _, light, initial = self.see(heights, noise)
         if _worse(figures, initial):
             why = f"its start was better and is kept: {_difference(figures, initial)}"
             self.state = replace(self.designer.showing(state, heights), reason=f"{state.reason}; {why}")

@@ -36,12 +36,14 @@ def wave_figures(
     target: np.ndarray | None,
     seen: Resolution,
     *,
+    wavelengths: tuple[float, ...] = (),
     finer: float | None = None,
     required: bool = True,
     perturbation: Perturbation | None = None,
 ) -> tuple[WaveImage | None, dict]:
-    """The wave image of a lens at the scene's wavelengths, white light's where it says none, and its figures.  departure: of its
-    exit from the heights, as of `optics.waves.wave_image`; required: take it however long that takes, or raise NoWaveImage.
+    """The wave image of a lens at the scene's wavelengths, white light's where it says none, and its figures.  wavelengths: others,
+    nm, see `Light.lines`; perturbation: as of `optics.waves.wave_image`; required: take it however long that takes, or raise
+    NoWaveImage.
 
     Returns:
         the image, None if it is not available and `required` is false; and wave_relative_rms, wave_psnr_db, wave_ssim,
@@ -55,7 +57,8 @@ def wave_figures(
     most = math.inf if required else UNASKED
     try:
         finer = finer or (FINER if scene.light.continuum is None else 1.0)
-        found = wave_image(scene, field, heights.detach(), finer=finer, perturbation=perturbation, most=most)
+        how = {"finer": finer, "perturbation": perturbation, "most": most}
+        found = wave_image(scene, field, heights.detach(), wavelengths=wavelengths or None, **how)
     except NoWaveImage as error:
         if required:
             raise
