@@ -86,6 +86,15 @@ def kernels(request, monkeypatch) -> str:
     return request.param
 
 
+@pytest.fixture(scope="module")
+def rays_alone():
+    """A wave image only where one is asked for, as if each took too long: beside the rays of a test it takes most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("effects", "waves"):
+            patch.setattr(f"caustic_cli.studies.{name}.UNASKED", 0.0)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _seeded():
     """Every test starts from the same generator state and leaves torch's defaults alone."""

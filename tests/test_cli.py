@@ -22,6 +22,8 @@ from caustic_cli.commands import console, parser
 from caustic_cli.commands import help as help_of
 from caustic_cli.export import FORMATS
 
+pytestmark = pytest.mark.usefixtures("rays_alone")
+
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
 SHARED_KEYS = {
     "loss",
@@ -64,7 +66,7 @@ def listing(folder: Path) -> dict:
 
 
 @pytest.fixture(scope="module")
-def designed(tmp_path_factory):
+def designed(tmp_path_factory, rays_alone):
     """A directory with a picture and its finished project, and what `design --json` said."""
     folder = tmp_path_factory.mktemp("cli")
     with pytest.MonkeyPatch.context() as patch:
@@ -611,7 +613,7 @@ def test_a_closed_pipe_is_not_an_error(arguments):
 
 
 def test_results_into_a_closed_pipe(here):
-    program = f"{shlex.quote(sys.executable)} -m caustic_cli render blob.caustic --rays 1000 --json --quiet; echo $? >&2"
+    program = f"{shlex.quote(sys.executable)} -m caustic_cli export blob.caustic --json --quiet; echo $? >&2"
     done = subprocess.run(["bash", "-c", f"({program}) | true"], capture_output=True, text=True, env=ENVIRONMENT, check=False)
     assert done.stderr == "0\n"
 
