@@ -611,7 +611,7 @@ def test_a_closed_pipe_is_not_an_error(arguments):
 
 
 def test_results_into_a_closed_pipe(here):
-    program = f"{shlex.quote(sys.executable)} -m caustic_cli render blob.caustic --rays 1000 --json --quiet; echo $? >&2"
+    program = f"{shlex.quote(sys.executable)} -m caustic_cli export blob.caustic --json --quiet; echo $? >&2"
     done = subprocess.run(["bash", "-c", f"({program}) | true"], capture_output=True, text=True, env=ENVIRONMENT, check=False)
     assert done.stderr == "0\n"
 

@@ -5,6 +5,7 @@ import math
 import re
 import tomllib
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -177,25 +178,31 @@ def test_only_flat_mirrors_are_seen_through():
             assert scene.unfolded is scene
 
 
+@cache
+def straight_waves():
+    """A scene without elements, its wave image, a picture, and what a design learns of another surface by it."""
+    light = Light(wavelengths=(550.0,), weights=(1.0,))
+    scene = replace(SCENE, light=light, screen=replace(SCREEN, shift=(3.0, 1.0)))
+    goal = torch.rand(PIXELS, PIXELS, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    learnt = WaveObjective(scene, FIELD, wavy(), goal, "rms", dtype=torch.float64)(wavy(0.0501))
+    return scene, wave_image(scene, FIELD, wavy()).image, goal, learnt
+
+
 @pytest.mark.parametrize(("tilt", "axis"), [((45.0, 0.0), 1), ((0.0, -50.0), 0)])
 def test_the_wave_image_behind_a_flat_mirror_is_that_of_the_straight_scene_mirrored(tilt, axis):
     """As the image of its rays; with it the loss that a design reduces, and its derivative, by the mirrored picture."""
-    light, shift = Light(wavelengths=(550.0,), weights=(1.0,)), np.array([3.0, 1.0])
-    straight = replace(SCENE, light=light, screen=replace(SCREEN, shift=tuple(shift)))
+    straight, one, goal, learnt = straight_waves()
+    shift = np.array(straight.screen.shift)
     turned = replace(SCREEN, shift=tuple(np.where(np.arange(2) == axis, -shift, shift)))
     folded = replace(straight, screen=turned, elements=(mirror(120.0, tilt),))
-    one, other = (wave_image(scene, FIELD, wavy()).image for scene in (straight, folded))
+    other = wave_image(folded, FIELD, wavy()).image
     assert torch.allclose(other.flip(axis), one, atol=1e-5 * float(one.max()))
     rays = expose(folded, FIELD, wavy(), rays_of(SCENE, "stratified", 200_000, 1)).image
     assert float((other - rays).norm() / rays.norm()) < 0.03
     assert float((other.flip(axis) - rays).norm() / rays.norm()) > 0.5
-    goal = torch.rand(PIXELS, PIXELS, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    losses = [
-        WaveObjective(scene, FIELD, wavy(), picture, "rms", dtype=torch.float64)(wavy(0.0501))
-        for scene, picture in ((straight, goal), (folded, goal.flip(axis)))
-    ]
-    assert losses[1].loss == pytest.approx(losses[0].loss, rel=1e-6)
-    first, second = (evaluation.gradients[EXIT] for evaluation in losses)
+    found = WaveObjective(folded, FIELD, wavy(), goal.flip(axis), "rms", dtype=torch.float64)(wavy(0.0501))
+    assert found.loss == pytest.approx(learnt.loss, rel=1e-6)
+    first, second = (evaluation.gradients[EXIT] for evaluation in (learnt, found))
     assert float((first - second).norm()) < 1e-4 * float(first.norm())
 
 

@@ -156,7 +156,7 @@ def test_the_order_of_the_methods(order):
     q = real([1.0, -0.4], [0.2, 0.9], -0.5)
     p = launched(field, q, real([0.3, 0.1], 0.1, 1.0))
     t = torch.full((2,), 3.0, dtype=D)
-    exact, steps = flow(field, None, q, p, t, 2048, 6), [16, 32, 64, 128]
+    exact, steps = flow(field, None, q, p, t, 512, 6), [16, 32, 64, 128]
 
     def fitted(values) -> float:
         return -np.polyfit(np.log(steps), np.log(values), 1)[0]

@@ -16,7 +16,7 @@ from caustic_cli.studies.retrace import retrace
 sys.path.append(str(Path(__file__).parent / "benchmarks"))
 from others import Sheet, expose, grid, read_lens, read_obj
 
-RAYS, PIXELS = 1e6, 25
+RAYS, PIXELS = 2.5e5, 12
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def rendered(tmp_path_factory):
     scene, field, heights = make(control=(8, 8), relief=0.01)
     scene = replace(scene, screen=Screen((30.0, 30.0), 300.0, (PIXELS, PIXELS)))
     path = tmp_path_factory.mktemp("others") / "lens.obj"
-    write_obj(path, scene, field, heights, samples=(321, 321))
+    write_obj(path, scene, field, heights, samples=(161, 161))
     exposure, figures = retrace(scene, field, heights, None, rays=int(RAYS))
     return path, exposure.image.numpy(), figures["on_screen"] + figures["lost"]["fresnel"]
 

@@ -46,7 +46,7 @@ def home(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(directory)
         write_blob()
-        small = ["--resolution", "64", "--iterations", "3", "--waves", "off", "--threads", "1", "--quiet"]
+        small = ["--resolution", "64", "--quality", "draft", "--iterations", "3", "--waves", "off", "--threads", "1", "--quiet"]
         for name, given in DESIGNS.items():
             assert cli.run(["design", "blob.png", *small, *given, "-o", f"{name}.caustic"]) == 0
             assert cli.run(["render", f"{name}.caustic", "--rays", "1e5", *RAYS, "--html", f"{name}.html", "--quiet"]) == 0
@@ -73,9 +73,7 @@ def rendered(home: Path, name: str, *options: str) -> np.ndarray:
 
 def browsed(page: Path, setting: str, engine: str, profile: Path) -> str:
     """The document after the page has traced a setting."""
-    if BROWSER is None:
-        pytest.skip("no Chromium or Chrome is installed")
-    command = [BROWSER, "--headless=new", "--no-sandbox", *QUIET, *ENGINES[engine], f"--user-data-dir={profile}"]
+    command = [str(BROWSER), "--headless=new", "--no-sandbox", *QUIET, *ENGINES[engine], f"--user-data-dir={profile}"]
     command += ["--virtual-time-budget=600000", "--dump-dom", f"{page.as_uri()}#engine={engine}&numbers&{setting}"]
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
 
@@ -111,6 +109,7 @@ CASES = {
 }
 
 
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
 @pytest.mark.parametrize(
     "case, engine", [(case, "cpu") for case in ("plane", "leaning light", "a disc", "mirror", "round")] + [("a point aside", "gpu")]
 )

@@ -131,8 +131,12 @@ def chi_square(*samples: np.ndarray, bins: int) -> float:
 
 def lattice_strength(a: np.ndarray, b: np.ndarray, order: int = 12) -> float:
     """Largest |mean exp(2 pi i (k a + l b))|^2 N over 0 < |(k, l)| <= order: about log(300) = 6 for noise, N for a lattice."""
-    k = np.arange(-order, order + 1)
-    spectrum = np.exp(2j * np.pi * np.outer(k, a)) @ np.exp(2j * np.pi * np.outer(k, b)).T
+
+    def waves(values):
+        up = np.cumprod(np.broadcast_to(np.exp(2j * np.pi * values), (order, len(values))), axis=0)  # of 1, 2 ... order periods
+        return np.concatenate([up[::-1].conj(), np.ones((1, len(values))), up])
+
+    spectrum = waves(a) @ waves(b).T
     power = np.abs(spectrum) ** 2 / len(a)
     power[order, order] = 0.0
     return float(power.max())

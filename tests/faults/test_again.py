@@ -37,6 +37,7 @@ def designed(tmp_path_factory):
 def _here(designed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True")  # without its report a design is not complete
+    monkeypatch.setattr("caustic_cli.studies.design_report.write_report", lambda path, *rest: path.write_bytes(b"a report"))
     shutil.copytree(designed, "blob.caustic")
 
 
@@ -51,7 +52,6 @@ def killed(*_):
 @pytest.mark.parametrize("at", ["first stage", "first checkpoint", "index"])
 def test_a_design_killed_before_its_first_checkpoint_is_begun_anew(at, capfd, monkeypatch):
     """By the same command, as if nothing had been there; another command, or an edit, still finds a design in its way."""
-    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True")  # without which a design is not complete
     where, name = (workflow, "_run") if at == "first stage" else (workflow._Records, "keep")
     options = ["--quiet", "--threads", "1", *(["--gradient", "free", "--index-control", "8"] if at == "index" else [])]
     command = [*(a for a in DESIGN if at != "index" or a not in ("--start", "offset")), *options]
@@ -78,7 +78,6 @@ def test_a_design_killed_before_its_first_checkpoint_is_begun_anew(at, capfd, mo
 
 def test_a_resumed_design_remembers_its_command(capfd, monkeypatch):
     """Resumed before its first checkpoint, it is found by the command that began it, which has nothing left to do."""
-    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True")
     shutil.rmtree("blob.caustic")
     write_picture()
     with monkeypatch.context() as patch:

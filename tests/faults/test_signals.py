@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -90,9 +91,9 @@ def test_a_signal_while_the_command_line_is_loaded(module, number):
     ended(["-c", AT_IMPORT, module, int(number), "--version"], number)
 
 
-@SIGNALS
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(("command", "number"), [*zip(COMMANDS, cycle(WORDS), strict=False)], ids=COMMANDS)
 def test_a_signal_while_torch_is_loaded(command, number):
+    """Every command, the two signals in turn, since one handler has both."""
     if command in {"render", "gradmap", "export"}:  # which look for a project before they load torch
         Path("blob.caustic").mkdir()
         Path("blob.caustic/project.toml").touch()
@@ -114,8 +115,8 @@ def children(pid: int) -> list[int]:
 
 @pytest.mark.skipif(not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="this system has no list of children")
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2 if hasattr(os, "sched_getaffinity") else True, reason="one core")
-@SIGNALS
-def test_a_signal_while_kernels_are_compiled_leaves_nobody_at_work(tmp_path, number):
+def test_a_signal_while_kernels_are_compiled_leaves_nobody_at_work(tmp_path):
+    number = signal.SIGTERM  # one handler has both
     with subprocess.Popen(
         [sys.executable, "-m", "caustic_cli", "convergence", "--quiet"],
         env=ENVIRONMENT | {"NUMBA_CACHE_DIR": str(tmp_path / "kept")},
