@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from functools import cache
 from pathlib import Path
 
 from caustic_cli.cli import THREADS
@@ -12,6 +13,8 @@ os.environ["CAUSTIC_EFFORT"] = "test"  # designs are small, here and in subproce
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
+
+from caustic_cli.commands import parser
 
 with warnings.catch_warnings():  # torch loads this module on the first forward-mode derivative, and it warns of torch itself
     warnings.simplefilter("ignore", DeprecationWarning)
@@ -86,12 +89,21 @@ def kernels(request, monkeypatch) -> str:
     return request.param
 
 
-@pytest.fixture(scope="module")
-def rays_alone():
-    """A wave image only where one is asked for, as if each took too long: beside the rays of a test it takes most of the time."""
+@pytest.fixture(autouse=True, scope="session")
+def _quick_wave_images():
+    """None that takes more samples than those of a lens of some 4 mm, unless it is asked for: of a default lens it takes up to half
+    a minute, beside rays that take a tenth of a second."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("effects", "waves"):
-            patch.setattr(f"caustic_cli.studies.{name}.UNASKED", 0.0)
+            patch.setattr(f"caustic_cli.studies.{name}.UNASKED", 2e7)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_parser():
+    """One for all commands of a process: to make it takes most of the time of a command that is refused."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parser, "parser", cache(parser.parser))
         yield
 
 

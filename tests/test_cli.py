@@ -22,8 +22,6 @@ from caustic_cli.commands import console, parser
 from caustic_cli.commands import help as help_of
 from caustic_cli.export import FORMATS
 
-pytestmark = pytest.mark.usefixtures("rays_alone")
-
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
 SHARED_KEYS = {
     "loss",
@@ -66,7 +64,7 @@ def listing(folder: Path) -> dict:
 
 
 @pytest.fixture(scope="module")
-def designed(tmp_path_factory, rays_alone):
+def designed(tmp_path_factory):
     """A directory with a picture and its finished project, and what `design --json` said."""
     folder = tmp_path_factory.mktemp("cli")
     with pytest.MonkeyPatch.context() as patch:

@@ -21,8 +21,6 @@ from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 from caustic_cli.studies.retrace import retrace
 
-pytestmark = pytest.mark.usefixtures("rays_alone")
-
 BASE = "--resolution 24 --quality draft --control 35 --rays 20000 --iterations 3 --waves off --margin 0 --linear --quiet --json"
 
 

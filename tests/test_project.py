@@ -23,8 +23,6 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import MADE, Project, beside
 from caustic_cli.workflow import design as workflow
 
-pytestmark = pytest.mark.usefixtures("rays_alone")
-
 CONFIG = """
 [lens]
 control = [9, 8]
