@@ -235,4 +235,4 @@ def test_the_page_keeps_colours_in_the_gamut_as_images_do():
     colours = np.random.default_rng(0).uniform(-0.5, 2.0, (200, 3))
     program = "\n".join([*needed, f"console.log(JSON.stringify({colours.tolist()}.map(intoGamut)))"])
     found = json.loads(subprocess.run(["node", "-e", program], capture_output=True, text=True, check=True).stdout)
-    np.testing.assert_allclose(found, _into_gamut(colours), rtol=0, atol=2e-4)  # the luminances there are of four digits
+    np.testing.assert_allclose(found, _into_gamut(colours), rtol=0, atol=1e-6)

@@ -404,7 +404,7 @@ function graphicsTracer(cloud, slowToo) {
 
 const sum = (values) => values.reduce((a, b) => a + b, 0);
 const most = (values) => values.reduce((a, b) => Math.max(a, b), 0);
-const LUMINANCE = [0.2126, 0.7152, 0.0722]; // of linear sRGB
+const LUMINANCE = [0.2126390, 0.7151687, 0.0721923]; // of linear sRGB
 const srgb = (v) => (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055);
 
 /** Paint a canvas from a function of the pixel's index that gives red, green and blue, 0 to 255. */
