@@ -15,7 +15,6 @@ import torch
 from numba import cuda
 from numba.cuda import dispatcher
 from numba.cuda.cudadrv import nvvm
-from torch.autograd import forward_ad
 
 from caustic_cli.optics import trace
 from caustic_cli.optics.backends.cuda import Cuda
@@ -40,11 +39,9 @@ def compile_for(kernel, blocks: int, threads: int, arguments: tuple) -> None:
 
 
 def differentiate(function, *inputs) -> None:
-    """A function of tensors to tensors in both modes."""
+    """A function of tensors to tensors and its gradient."""
     leaves = [v.clone().requires_grad_() for v in inputs]
     torch.autograd.grad(sum(out.sum() for out in function(*leaves) if out.requires_grad), leaves, allow_unused=True)
-    with forward_ad.dual_level():
-        function(*(forward_ad.make_dual(v, torch.ones_like(v)) for v in inputs))
 
 
 def main() -> None:

@@ -1,9 +1,8 @@
-"""The CUDA kernels in numba's simulator, each against plain torch: values, gradients, tangents, and sums in another order.
+"""The CUDA kernels in numba's simulator, each against plain torch: values, gradients, and sums in another order.
 
 `test_cuda.py` runs this file in a process of its own with NUMBA_ENABLE_CUDASIM=1, which numba reads as it is loaded.
 
-Bounds.  Both sides round differently, some 1e-16 per operation: values agree to 1e-12 of the largest, gradients and tangents to
-1e-11.
+Bounds.  Both sides round differently, some 1e-16 per operation: values agree to 1e-12 of the largest, gradients to 1e-11.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from dataclasses import replace
 import numba
 import pytest
 import torch
-from torch.autograd import forward_ad
 
 from caustic_cli.optics.backends import plain
 from caustic_cli.optics.backends.cuda import Cuda
@@ -72,18 +70,10 @@ def gradients(function, inputs) -> list[torch.Tensor]:
     return [torch.zeros_like(v) if g is None else g for g, v in zip(found, leaves, strict=True)]
 
 
-def tangents(function, inputs) -> list[torch.Tensor]:
-    with forward_ad.dual_level():
-        dual = [forward_ad.make_dual(v, numbers(40 + k, *v.shape)) for k, v in enumerate(inputs)]
-        parts = [forward_ad.unpack_dual(t) for t in real(function(*dual))]
-        return [torch.zeros_like(p.primal) if p.tangent is None else p.tangent for p in parts]
-
-
 def compare(by_kernel, by_torch, inputs) -> None:
-    """Value, gradient and tangent of one function done by both."""
+    """Value and gradient of one function done by both."""
     assert apart(real(by_kernel(*inputs)), real(by_torch(*inputs))) < 1e-12
-    for derivatives in (gradients, tangents):
-        assert apart(derivatives(by_kernel, inputs), derivatives(by_torch, inputs)) < 1e-11, derivatives.__name__
+    assert apart(gradients(by_kernel, inputs), gradients(by_torch, inputs)) < 1e-11
 
 
 @pytest.fixture
@@ -154,7 +144,7 @@ def test_splat(filter, launched):
     x, y, weight = 2.2 * numbers(1, RAYS), 1.5 * numbers(2, RAYS), numbers(3, RAYS)
     by = [lambda *r, one=one: one.splat(*r, SCREEN, filter) for one in (Cuda(), Torch())]
     compare(*by, (x, y, weight))
-    same(launched(lambda: [*by[0](x, y, weight), *gradients(by[0], (x, y, weight)), *tangents(by[0], (x, y, weight))]))
+    same(launched(lambda: [*by[0](x, y, weight), *gradients(by[0], (x, y, weight))]))
 
 
 @pytest.mark.parametrize("fresnel", ["none", "schlick", "exact"])
@@ -314,7 +304,7 @@ def check_trace(scene, field, heights, kind, filters, launched, monkeypatch) -> 
             assert kernel.lost.get(name, 0.0) == pytest.approx(value, abs=1e-13)
         image, _ = kernel(heights)
         assert float(image.sum()) + sum(kernel.lost.values()) == pytest.approx(1.0, abs=1e-12)
-    same(launched(lambda: [*kernel(heights), *gradients(kernel, (heights,)), *tangents(kernel, (heights,))]))
+    same(launched(lambda: [*kernel(heights), *gradients(kernel, (heights,))]))
     return kernel.lost
 
 

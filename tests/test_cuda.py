@@ -16,6 +16,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.objective import Objective
@@ -127,6 +128,10 @@ def test_the_backend_of_a_device(kernels, name, monkeypatch):
     assert (backends.backend_for("cpu"), backends.backend_for("cuda:0")) == ("numba", name)
     monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
     assert backends.backend_for("cuda:0") == "torch"
+    monkeypatch.delenv("CAUSTIC_KERNELS")
+    with forward_ad.dual_level():  # the kernels have no tangents
+        assert backends.backend_for("cpu") == backends.backend_for("cuda:0") == backends.usable("numba") == "torch"
+    assert backends.usable("numba") == "numba"
     monkeypatch.setenv("CAUSTIC_KERNELS", "numpy")
     with pytest.raises(InputError, match="torch or cuda"):
         backends.backend_for("cpu")

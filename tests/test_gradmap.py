@@ -1,17 +1,22 @@
 """The derivative of the image along one control height: three ways, its symmetries, its refusals, its picture."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import SAMPLERS, Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
-from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
+from caustic_cli.optics.trace import Tracer, tracers
+from caustic_cli.scene import Component, Disc, FreeForm, Lens, Light, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.sources.several import Several
+from caustic_cli.studies import gradmap
 from caustic_cli.studies.gradmap import compare, difference_step, finite_difference, gradient_image, plot_gradient, shown_part
 
 COSINE = Filter("cosine", (3, 5))  # C1: central differences are sharp
@@ -60,6 +65,57 @@ def test_dot_product_identity_with_reverse_mode(kind, filter):
         assert forward.abs().sum() > 0
         scale = float(y.norm() * forward.norm())
         assert float((y * forward).sum()) == pytest.approx(float(pulled[control]), abs=1e-12 * scale)
+
+
+def scenes() -> dict[str, Scene]:
+    """Scenes in which rays meet the exit elsewhere than where they are sampled, and others, by name."""
+    scene, _, _ = bumpy()
+    lens, screen, point = scene.lens, scene.screen, Points(((0.5, -0.3, -40.0),))
+    front = FreeForm(0.02 * np.sin(np.arange(42.0)).reshape(7, 6), (3, 3))
+    mirror = Lens((10.0, 8.0), 0.0, 1.5443, (9, 8), (3, 2), mirror=True)
+    return {
+        "point": replace(scene, source=point),
+        "round": replace(scene, source=point, lens=replace(lens, size=(8.0, 8.0), aperture="circle", fresnel="schlick")),
+        "disc": replace(scene, source=Disc((0.0, 0.1, -30.0), (2.0, 1.0))),
+        "sun": replace(scene, source=Disc(angle=2.0)),
+        "several": replace(scene, source=Several((PlaneWave(), point), (((), ()),) * 2)),
+        "polarised": replace(scene, source=point, light=Light(polarisation=30.0)),
+        "coloured": replace(scene, source=point, lens=replace(lens, glass="N-BK7"), light=Light(wavelengths=(450.0, 650.0))),
+        "absorbing and rough": replace(scene, source=point, lens=replace(lens, absorption=0.02, roughness=0.01)),
+        "tilted": replace(scene, source=point, screen=replace(screen, tilt=(20.0, -10.0))),
+        "curved": replace(scene, screen=replace(screen, radius=(80.0, 80.0))),
+        "two sides": replace(scene, lens=replace(lens, entrance=front)),
+        "lens in front": replace(scene, elements=(Component(-12.0, (14.0, 14.0), 3.0, (60.0, -80.0)),)),
+        "mirror": Scene(PlaneWave(), mirror, Screen((14.3, 11.7), -100.0, (23, 19))),
+        "mirror, point": Scene(point, mirror, Screen((14.3, 11.7), -100.0, (23, 19))),
+    }
+
+
+@pytest.mark.parametrize("kind", ["lines", "stratified"])
+@pytest.mark.parametrize("name", scenes())
+def test_rays_under_the_control_point_are_all_that_matter(name, kind, monkeypatch):
+    """<y, J e_ij> = <J' y, e_ij> with all rays traced by the kernels; a few of them by plain torch are enough."""
+    scene, (_, _, heights) = scenes()[name], bumpy()
+    field = HeightField.of(scene.lens)
+    rays, traced = rays_of(scene, kind, 3000, 3), []
+    leaf, y = heights.clone().requires_grad_(), torch.randn(23, 19, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for tracer in tracers(scene, field, rays, torch.float64, 1000):
+        image = tracer.expose({EXIT: leaf}, scene.screen, COSINE).image
+        (y * (image.sum(0) if scene.colored else image)).sum().backward()
+
+    def tracer(*arguments, **options):
+        made = Tracer(*arguments, **options)
+        traced.append((made.start.count, torch.is_grad_enabled()))
+        return made
+
+    monkeypatch.setattr(gradmap, "Tracer", tracer)
+    for control in ((4, 3), (3, 2), (5, 5)):
+        forward = gradient_image(scene, field, heights, control, sampler=rays, filter=COSINE, chunk=1000)
+        scale = float(y.norm() * forward.norm())
+        assert scale > 0.0
+        assert float((y * forward).sum()) == pytest.approx(float(leaf.grad[control]), abs=1e-11 * scale)
+    differentiated = sum(count for count, gradient in traced if gradient)
+    assert 0 < differentiated < 0.6 * 3 * rays.count * len(scene.bands)
 
 
 @pytest.mark.parametrize(("degree", "size"), [((3, 3), (3, 3)), ((3, 3), (11, 11)), ((5, 3), (3, 3))])

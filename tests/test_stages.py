@@ -1,14 +1,13 @@
-"""The stages of a trace as kernels, each against plain torch: values, adjoints, tangents and odd cases.
+"""The stages of a trace as kernels, each against plain torch: values, adjoints and odd cases.
 
 Bounds.  Both sides round differently, some 1e-16 per operation: values agree to 1e-13 of the largest, gradients to 1e-12 of their
-norm, and <y, J v> = <J' y, v> to 1e-12 of the sum of its terms' sizes.
+norm.
 """
 
 from __future__ import annotations
 
 import pytest
 import torch
-from torch.autograd import forward_ad
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.interface import reflect, reflectance, reflectances, refract
@@ -188,22 +187,6 @@ def test_gradients(case):
         assert float((a - b).norm()) <= 1e-12 * float(b.norm()) + 1e-20
 
 
-def test_forward_mode_is_the_transpose_of_reverse_mode(case):
-    inputs, kernel, _ = case
-    along = [numbers(30 + k, *t.shape) for k, t in enumerate(inputs)]
-    with forward_ad.dual_level():
-        outs = differentiable(kernel(*(forward_ad.make_dual(t, v) for t, v in zip(inputs, along, strict=True))))
-        tangents = [forward_ad.unpack_dual(t).tangent for t in outs]
-    leaves = [t.clone().requires_grad_() for t in inputs]
-    by = [numbers(10 + k, *t.shape) for k, t in enumerate(tangents)]
-    gradients = torch.autograd.grad(differentiable(kernel(*leaves)), leaves, by)
-    forward = [(y * t).sum() for y, t in zip(by, tangents, strict=True)]
-    size = sum(float((y * t).abs().sum()) for y, t in zip(by, tangents, strict=True))
-    reverse = sum(float((g * v).sum()) for g, v in zip(gradients, along, strict=True))
-    assert size > 0.0
-    assert abs(float(sum(forward)) - reverse) <= 1e-12 * size
-
-
 def test_each_derivative_alone(case):
     """What one input's derivative is does not depend on whether others are wanted."""
     inputs, kernel, _ = case
@@ -219,16 +202,10 @@ def test_each_derivative_alone(case):
 
 def test_torch_func(case):
     inputs, kernel, _ = case
-    along = tuple(numbers(30 + k, *t.shape) for k, t in enumerate(inputs))
 
     def called(*t):
         return tuple(differentiable(kernel(*t)))
 
-    _, tangents = torch.func.jvp(called, tuple(inputs), along)
-    with forward_ad.dual_level():
-        outs = differentiable(kernel(*(forward_ad.make_dual(t, v) for t, v in zip(inputs, along, strict=True))))
-        for a, b in zip(tangents, outs, strict=True):
-            assert torch.equal(a, forward_ad.unpack_dual(b).tangent)
     outs, pull = torch.func.vjp(called, *inputs)
     by = tuple(numbers(10 + k, *t.shape) for k, t in enumerate(outs))
     leaves = [t.clone().requires_grad_() for t in inputs]

@@ -22,14 +22,17 @@ class RayTracer(Protocol):
     """The interface of `trace.Tracer` that effects use.
 
     system: the system traced; media: in front of each element and behind the last; sides: from which the axis reaches each
-    element; start: the rays at the first free surface; backend: implementation of the stages.
+    element; start: the rays at the first free surface.
     """
 
     system: System
     media: tuple[Medium, ...]
     sides: tuple[float, ...]
     start: RayState
-    backend: Any
+
+    @property
+    def backend(self) -> Any:
+        """Implementation of the stages."""
 
     def trace_element(
         self,

@@ -6,6 +6,7 @@ function prepared once for all heights.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -92,7 +93,7 @@ def _moved_before_surface(tracer, o, d, state: RayState, element, heights) -> tu
     return tuple(c.expand(state.power.shape) for c in moved), replace(state, path=path)
 
 
-def prepared_intersection(tracer):
+def prepared_intersection(tracer) -> Callable[[Tensor], SurfaceIntersection] | None:
     """Intersections of a tracer's rays `start` with the first free surface as a prepared function of its heights; None if that case
     is not covered."""
     system, first, start = tracer.system, tracer.first, tracer.start

@@ -139,6 +139,26 @@ class RayState:
             s = replace(s, u=u, v=v, tensor=False)
         return replace(self, origin=(x, y, self.origin[2]), power=power, sample=s, lost=dict(self.lost))
 
+    def only(self, kept: Tensor) -> RayState:
+        """Some of the rays, `kept` (N,) bool, with the losses of all."""
+        rays = self.expanded()
+
+        def of(value):
+            return value[kept] if isinstance(value, Tensor) and value.ndim else value
+
+        s, power = rays.sample, of(rays.power)
+        return replace(
+            rays,
+            origin=tuple(map(of, rays.origin)),
+            direction=tuple(map(of, rays.direction)),
+            power=power,
+            path=of(rays.path),
+            polarised=None if rays.polarised is None else tuple(map(of, rays.polarised)),
+            status=of(rays.status),
+            lost=dict(rays.lost),
+            sample=None if s is None else Sample(of(s.u), of(s.v), False, power),
+        )
+
 
 @dataclass
 class Hit:

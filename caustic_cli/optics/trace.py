@@ -20,7 +20,7 @@ Powers are fractions of the sources' power.  Energy is conserved: image + every 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.backends import Fused, backend_for
+from caustic_cli.optics.backends import Fused, backend_for, in_forward_mode, usable
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Rays, of_member, rays_of
 from caustic_cli.optics.frames import rotate_to_global, rotate_to_local
@@ -45,7 +45,7 @@ from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.screen_shape import reach
-from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.optics.system import EXIT, Element, PlacedScreen, System
 from caustic_cli.scene import Scene, Screen
 
@@ -92,8 +92,9 @@ class Tracer:
         pupil = system.pupil
         state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
         state = replace(state, lost=dict(state.lost), wavelength=wavelength)
-        self.backend = backend_for(state.power.device)
-        self.dtype = self.backend.precision(dtype)
+        self._backend = backend_for(state.power.device)
+        self._prepared: dict[str, Callable[[Tensor], SurfaceIntersection] | None] = {}
+        self.dtype = self._backend.precision(dtype)
         acting = EFFECTS.acting(system, requests)
         for effect in acting:
             state = effect.prepare(system, state, requests)
@@ -142,10 +143,18 @@ class Tracer:
     def _owners(self) -> tuple[int | None, ...]:
         return self.system.owners()
 
-    @cached_property
-    def prepared_intersection(self):
-        """See `ray_transfer.prepared_intersection`."""
-        return prepared_intersection(self)
+    @property
+    def backend(self):
+        """The implementation of the stages: in forward mode the reference."""
+        return usable(self._backend)
+
+    @property
+    def prepared_intersection(self) -> Callable[[Tensor], SurfaceIntersection] | None:
+        """See `ray_transfer.prepared_intersection`; made once by each backend."""
+        name = self.backend.name
+        if name not in self._prepared:
+            self._prepared[name] = prepared_intersection(self)
+        return self._prepared[name]
 
     def _interactions(self, parameters: Parameters) -> Iterator[Interaction]:
         """The sequential trace from the first free surface to the last element."""
@@ -182,7 +191,7 @@ class Tracer:
 
     def expose(self, parameters: Parameters, screen: Screen | PlacedScreen, filter: Filter) -> Image[Tensor]:
         """Heights {name: (n, m) mm float64} -> image and energy balance on a screen."""
-        if self.fused is not None and covers(screen):
+        if self.fused is not None and covers(screen) and not in_forward_mode():
             image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
             for name, value in self.start.lost.items():
                 lost[name] = lost.get(name, 0.0) + value

@@ -5,9 +5,10 @@ Notation
     P_ij        control height, mm;  N_i(u) N_j(v) its basis function
     dJ/dP_ij    (n_x, n_y), parts of the source's power per mm
 
-The rays are constants and J = sum over rays, so the tangent of the image is the sum of the tangents of chunks.  A plane
-wave's rays behind a flat entrance are sampled on the surface itself: those outside the support of N_i N_j have no tangent at
-all and are not traced, so the cost is that of the rays under one basis function.  Pixels they cannot reach stay exactly 0.
+The rays are constants and J = sum over rays, so the derivative of the image is the sum of those of chunks.  Rays that meet the
+surface outside the support of N_i N_j have none at all: the kernels find where rays meet it, and plain torch, whose operations have
+a forward mode, traces and differentiates the few that are left.  A plane wave's rays behind a flat entrance are sampled on the
+surface itself.  Pixels that no ray under the basis function can reach stay exactly 0.
 
 Shares that a ray keeps within the frame sum to its weight, so dJ/dP_ij sums to 0 where nothing is reflected and no ray
 crosses the frame's border.  Bincount has a derivative of 0 almost everywhere and is refused.
@@ -27,7 +28,9 @@ from torch.autograd import forward_ad
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import SOFTWARE, atomic_file
+from caustic_cli.optics.effects import Requests
 from caustic_cli.optics.emission import Rays, of_member
+from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -41,6 +44,10 @@ DERIVATIVE = Capability(
     {"gradient index": "the image's derivative by one height is taken of lenses of one index, and this one's varies"},
 )
 
+#: Neither the rays' way to the surface nor plain torch needs a fused kernel.
+STAGES = Requests(stages=True)
+#: Margin of the support in u and v, for the rounding of where a ray meets the surface.
+BESIDE = 1e-9
 #: Least margin, pixels, around the non-zero part that a plot shows.
 LEAST_BESIDE = 3.0
 #: Pixels by which a central difference may move a landing point.  With d pixels the relative error is of order d^2 (the
@@ -86,13 +93,12 @@ def gradient_image(
     heights = heights.detach().to(sampler.device, torch.float64)
     total = torch.zeros(scene.screen.resolution, dtype=torch.float64, device=sampler.device)
     for band in scene.bands:
-        system, traced = System.of(band.scene, field), None
+        system = System.of(band.scene, field)
         for rays in of_member(sampler, band.member).chunks(chunk):
-            if isinstance(rays, Sample) and scene.axial:
-                rays = _under(field, control, rays)
-                if not all(rays.shape):
-                    continue
-            traced = Tracer(system, rays, dtype, like=traced)
+            few = _under(field, control, heights, scene, system, rays)
+            if not few.count:
+                continue
+            traced = Tracer(system, few, dtype, STAGES)
             with forward_ad.dual_level():
                 image = traced.expose({EXIT: forward_ad.make_dual(heights, direction)}, scene.screen, filter).image
                 total += band.weight * forward_ad.unpack_dual(image).tangent.double()
@@ -248,16 +254,34 @@ def _direction(field: HeightField, control: tuple[int, int]) -> Tensor:
     return unit
 
 
-def _under(field: HeightField, control: tuple[int, int], sample: Sample) -> Sample:
-    """The rays of a sample in the closed support [t_i, t_{i+p+1}] x [t_j, t_{j+q+1}] of a basis function."""
-    inside = []
-    for space, k, at in zip(field.spaces, control, (sample.u, sample.v), strict=True):
-        low, high = float(space.knots[k]), float(space.knots[k + space.degree + 1])
-        inside.append((at >= low) & (at <= high))
-    flux = sample.flux
+@torch.no_grad()
+def _under(
+    field: HeightField, control: tuple[int, int], heights: Tensor, scene: Scene, system: System, rays: Sample | RayState
+) -> RayState:
+    """Those of the rays on the pupil that meet the exit in the support of a basis function."""
+    pupil = system.pupil
+    if isinstance(rays, Sample) and scene.axial:
+        return RayState.on_axis(_sampled_under(field, control, rays), pupil.half_size, pupil.z)
+    state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
+    traced = Tracer(system, state, requests=STAGES)
+    x, y = traced.trace_element(traced.first, traced.start, heights).hit.local[:2]
+    in_u, in_v = _in_support(field, control, *(0.5 * (c / r + 1.0) for c, r in zip((x, y), field.half_size, strict=True)))
+    return state.only(in_u & in_v)
+
+
+def _sampled_under(field: HeightField, control: tuple[int, int], sample: Sample) -> Sample:
+    """The rays of a sample of the exit itself in the support of a basis function."""
+    (in_u, in_v), flux = _in_support(field, control, sample.u, sample.v), sample.flux
     if sample.tensor:
-        if flux.ndim:
-            flux = flux[inside[0]][:, inside[1]]
-        return Sample(sample.u[inside[0]], sample.v[inside[1]], True, flux)
-    both = inside[0] & inside[1]
+        return Sample(sample.u[in_u], sample.v[in_v], True, flux[in_u][:, in_v] if flux.ndim else flux)
+    both = in_u & in_v
     return Sample(sample.u[both], sample.v[both], False, flux[both] if flux.ndim else flux)
+
+
+def _in_support(field: HeightField, control: tuple[int, int], u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Which u and which v are in the closed support [t_i, t_{i+p+1}] x [t_j, t_{j+q+1}] of a basis function."""
+    inside = []
+    for space, k, at in zip(field.spaces, control, (u, v), strict=True):
+        low, high = float(space.knots[k]), float(space.knots[k + space.degree + 1])
+        inside.append((at >= low - BESIDE) & (at <= high + BESIDE))
+    return inside[0], inside[1]

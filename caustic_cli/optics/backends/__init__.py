@@ -1,6 +1,6 @@
 """Computational backends: implementations of the stages of a trace, selected by device.
 
-Stages, each with its adjoint and tangent
+Stages, each with its adjoint
     scatter                    random points of the aperture
     spline_on, spline_at       height and slopes of a B-spline at a sample, or at given points
     intersect, intersect_spline, intersect_fixed   intersections with any surface, with a B-spline, or of fixed rays with a B-spline
@@ -11,7 +11,8 @@ Stages, each with its adjoint and tangent
     splat                      accumulation on pixels
 
 `reference.Torch` implements every stage in plain torch, on any device; `cpu.Numba` and `cuda.Cuda` use compiled kernels.  Callers
-do not depend on which one is used.  CAUSTIC_KERNELS=torch selects the reference; CAUSTIC_KERNELS=cuda the device's kernels also on
+do not depend on which one is used.  The kernels are differentiated in reverse mode only: within a dual level of forward mode the
+reference stands in for every one.  CAUSTIC_KERNELS=torch selects the reference; CAUSTIC_KERNELS=cuda the device's kernels also on
 a CPU, in numba's simulator (NUMBA_ENABLE_CUDASIM=1), for tests.
 """
 
@@ -25,6 +26,7 @@ from importlib import import_module
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.reconstruction import Filter
@@ -38,16 +40,26 @@ Fused = Callable[[Tensor, Screen, Filter], tuple[Tensor, Tensor, dict]]
 KERNELS = ("", "torch", "cuda")
 
 
+def in_forward_mode() -> bool:
+    """Whether a dual level of forward-mode differentiation is entered (`torch.autograd.forward_ad`)."""
+    return forward_ad._current_level >= 0
+
+
 def backend_for(device: torch.device | str):
-    """The backend for tensors on `device`."""
+    """The backend for tensors on `device`; the reference in forward mode."""
     kernels = os.environ.get("CAUSTIC_KERNELS", "")
     if kernels not in KERNELS:
         raise InputError(f"the environment's CAUSTIC_KERNELS must be torch or cuda, or not be set, got {kernels!r}")
-    if kernels == "torch":
+    if kernels == "torch" or in_forward_mode():
         return _made("torch")
     if torch.device(device).type == "cpu":
         return _made("cuda" if kernels == "cuda" and os.environ.get("NUMBA_ENABLE_CUDASIM") == "1" else "numba")
     return _made("cuda" if cuda_kernels() else "torch")
+
+
+def usable(backend):
+    """The backend itself; in forward mode the reference."""
+    return _made("torch") if in_forward_mode() else backend
 
 
 @cache

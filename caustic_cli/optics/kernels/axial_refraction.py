@@ -20,8 +20,8 @@ NONE, SCHLICK, EXACT = 0, 1, 2
 FRESNEL = {"none": NONE, "schlick": SCHLICK, "exact": EXACT}
 # Rows of a block's scratch vectors: the surface, powers, landing points, derivatives, normalisation of the results of
 # `filter_weights`, the rays' points and powers; five more for internal use.
-SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH = range(16)
-OVER_X, OVER_Y, LEAN_X, LEAN_Y, X, Y, FLUX, VECTORS = range(16, 24)
+SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, BY_SAG, BY_GX, BY_GY, REACH = range(15)
+OVER_X, OVER_Y, LEAN_X, LEAN_Y, X, Y, FLUX, VECTORS = range(15, 23)
 SCRATCH = 5
 
 
@@ -132,25 +132,9 @@ def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
 
 @njit(inline="always", **FAST)
 def pull(vectors, exit_):
-    """Adjoint: derivatives by sag and slopes, in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
+    """Adjoint: derivatives by sag and slopes, in BY_SAG, BY_GX, BY_GY, from those by power and pixel coordinates."""
     n, height, v = exit_.index, exit_.height, vectors
     _by_a(exit_.fresnel, v[SAG], v[GX], v[GY], v[FLUX], v[BY_POWER], v[BY_PX], v[BY_PY], n, height, v[BY_A])
-    _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[T_GX])
-    _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[T_GY])
-    _by_sag(v[REACH], v[SAG], v[GX], v[GY], v[BY_PX], v[BY_PY], height, v[T_SAG])
-
-
-@njit(**FAST)
-def push(vectors, exit_, frame):
-    """Tangents of power and pixel coordinates, in T_POWER, BY_PX, BY_PY, along T_SAG, T_GX, T_GY."""
-    n, height, v = exit_.index, exit_.height, vectors
-    for j in range(v.shape[1]):
-        gx, gy, tx, ty = v[GX, j], v[GY, j], v[T_GX, j], v[T_GY, j]
-        a, da = gx * gx + gy * gy, 2.0 * (gx * tx + gy * ty)
-        m, dm = _m(a, n)
-        _, dr = _reflected(exit_.fresnel, a, n)
-        h = height - v[SAG, j]
-        change = -v[T_SAG, j] * m + h * dm * da
-        v[T_POWER, j] = -v[FLUX, j] * dr * da
-        v[BY_PX, j] = (change * gx + h * m * tx) / frame.pixel_x
-        v[BY_PY, j] = (change * gy + h * m * ty) / frame.pixel_y
+    _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[BY_GX])
+    _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[BY_GY])
+    _by_sag(v[REACH], v[SAG], v[GX], v[GY], v[BY_PX], v[BY_PY], height, v[BY_SAG])

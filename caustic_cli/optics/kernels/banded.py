@@ -49,10 +49,6 @@ class _Contraction(torch.autograd.Function):
         _spread(ALL, by_value.contiguous().numpy(), by_slope.contiguous().numpy(), *ctx.along.arrays, out.numpy())
         return out, None
 
-    @staticmethod
-    def jvp(ctx, tangent, _):
-        return _Contraction.apply(tangent.detach(), ctx.along)  # within torch.func numbers are within reach only so
-
 
 @njit(entry=True, **FAST)
 def _contract(i, net, first, values, slopes, out, out_slope):

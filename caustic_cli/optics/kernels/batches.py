@@ -44,7 +44,7 @@ from numba.extending import intrinsic
 
 from caustic_cli.optics.kernels.intersect import HIT, MISSED, _leaves, _root, _value
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.spline import curvatures, jet, piece, push_powers
+from caustic_cli.optics.kernels.spline import curvatures, piece, push_powers
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import FEW_ULP, LEAST_COSINE
 
@@ -545,21 +545,6 @@ def pull_alone(c, i, j, xi, eta, wi, wj, by_t, by_u, by_v, direction, gx, gy, sc
     return by_x, by_y, (by_t + by_x * du + by_y * dv) / cosine
 
 
-@njit(inline="always", **FAST)
-def push_alone(c, i, j, xi, eta, wi, wj, change, move, direction, gx, gy, scale_x, scale_y):
-    """Tangents of distance and slopes of one ray.
-
-    change: those of Z, Z_xi and Z_eta at a fixed point; move: that of the point at fixed t, mm.
-    """
-    (z, z_xi, z_eta), (x, y, up), (du, dv, dz) = change, move, direction
-    uu, uv, vv = curvatures(c, i, j, xi, eta)
-    uu, uv, vv = uu * wi * wi, uv * wi * wj, vv * wj * wj
-    z += gx * x + gy * y - up
-    along = z / max(dz - gx * du / scale_x - gy * dv / scale_y, LEAST_COSINE)
-    u, v = x * scale_x + along * du, y * scale_y + along * dv
-    return along, (z_xi * wi + uu * u + uv * v) * scale_x, (z_eta * wj + uv * u + vv * v) * scale_y
-
-
 @njit(entry=True, **FAST)
 def pull_back(
     block,
@@ -691,91 +676,3 @@ def pull_back(
                         grad[a, b, k, m] += total[k, m]
                 total[:] = 0.0
         begin = end
-
-
-@njit(entry=True, **FAST)
-def push(
-    block,
-    change,
-    move_x,
-    move_y,
-    move_z,
-    met,
-    where,
-    ou,
-    ov,
-    du,
-    dv,
-    dz,
-    t,
-    gx,
-    gy,
-    c,
-    bu,
-    mu,
-    wu,
-    bv,
-    mv,
-    wv,
-    scale_x,
-    scale_y,
-    out_t,
-    out_x,
-    out_y,
-    blocks,
-):
-    """Tangents of the distances and slopes of `first_hits`, into out_t, out_x, out_y (N,).
-
-    change: of the coefficients; move_x, move_y, move_z (N,): of the rays' points that hit, at fixed t, mm; either may be empty.
-    """
-    if block == ALL:
-        on_threads(
-            blocks,
-            (
-                change,
-                move_x,
-                move_y,
-                move_z,
-                met,
-                where,
-                ou,
-                ov,
-                du,
-                dv,
-                dz,
-                t,
-                gx,
-                gy,
-                c,
-                bu,
-                mu,
-                wu,
-                bv,
-                mv,
-                wv,
-                scale_x,
-                scale_y,
-                out_t,
-                out_x,
-                out_y,
-                blocks,
-            ),
-        )
-        return
-    count, wide = len(t), len(bv) - 1
-    nets, moves = change.shape[0] > 0, len(move_x) > 0
-    for k in range(block * count // blocks, (block + 1) * count // blocks):
-        r = met[k]
-        out_t[r], out_x[r], out_y[r] = 0.0, 0.0, 0.0
-        if where[k] < 0:
-            continue
-        i, j = where[k] // wide, where[k] % wide
-        xi, eta = (ou[r] + t[r] * du[r] - mu[i]) * wu[i], (ov[r] + t[r] * dv[r] - mv[j]) * wv[j]
-        by_net, move = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        if nets:
-            by_net = jet(change, i, j, xi, eta)
-        if moves:
-            move = (move_x[r], move_y[r], move_z[r])
-        out_t[r], out_x[r], out_y[r] = push_alone(
-            c, i, j, xi, eta, wu[i], wv[j], by_net, move, (du[r], dv[r], dz[r]), gx[r], gy[r], scale_x, scale_y
-        )

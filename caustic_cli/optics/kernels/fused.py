@@ -1,4 +1,4 @@
-"""Fused CPU kernel: refraction at the exit surface -> landing point -> splat, with its adjoint and tangent.
+"""Fused CPU kernel: refraction at the exit surface -> landing point -> splat, with its adjoint.
 
 It combines the stages of `optics.trace`, row by row of rays without intermediate storage; the plain-torch backend is its reference.
 Everything is float64, since float32 was no faster.
@@ -17,9 +17,12 @@ import numpy as np
 from caustic_cli.optics.kernels import oblique_refraction
 from caustic_cli.optics.kernels.arguments import Splat
 from caustic_cli.optics.kernels.axial_refraction import (
+    BY_GX,
+    BY_GY,
     BY_POWER,
     BY_PX,
     BY_PY,
+    BY_SAG,
     FLUX,
     GX,
     GY,
@@ -34,10 +37,6 @@ from caustic_cli.optics.kernels.axial_refraction import (
     REACH,
     SAG,
     SCRATCH,
-    T_GX,
-    T_GY,
-    T_POWER,
-    T_SAG,
     VECTORS,
     X,
     Y,
@@ -46,7 +45,6 @@ from caustic_cli.optics.kernels.axial_refraction import (
     load,
     powers,
     pull,
-    push,
     reach,
 )
 from caustic_cli.optics.kernels.filter_weights import pixel_weights
@@ -208,31 +206,6 @@ def gather(vectors, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, col
         by_power[j], by_px[j], by_py[j] = grad_leaving + value, along_x * weight * scale_x, along_y * weight * scale_y
 
 
-@njit(**FAST)
-def _scatter_tangent(vectors, exit_, frame, splat, sx, sy, dx, dy, image):
-    """Add the tangent of one row's image; returns the leaving power's."""
-    vx, vy = splat.size_x, splat.size_y
-    rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
-    v, leaving, height = vectors, 0.0, exit_.height
-    for j in range(v.shape[1]):
-        weight, change = v[POWER, j], v[T_POWER, j]
-        if weight < 0.0:
-            continue
-        leaving += change
-        x, y = v[PX, j], v[PY, j]
-        if not (x >= low_x and x < high_x and y >= low_y and y < high_y and height > v[SAG, j]):
-            continue
-        i0, j0 = math.floor(x) + rx, math.floor(y) + ry
-        over = v[OVER_X, j] * v[OVER_Y, j]
-        move_x, move_y = over * weight * v[BY_PX, j], over * weight * v[BY_PY, j]
-        change = over * change - move_x * v[LEAN_X, j] - move_y * v[LEAN_Y, j]
-        for a in range(vx):
-            along, across = change * sx[a, j] + move_x * dx[a, j], move_y * sx[a, j]
-            for b in range(vy):
-                image[i0 + a, j0 + b] += along * sy[b, j] + across * dy[b, j]
-    return leaving
-
-
 def scratch_rows(splat: Splat) -> int:
     """Number of rows of a block's scratch memory."""
     return VECTORS + SCRATCH + 2 * (splat.size_x + splat.size_y)
@@ -382,77 +355,4 @@ def backward(
             oblique_refraction.pull(v, _oblique(i, surface, rays), exit_, nets[0, 0, i], nets[1, 0, i], nets[2, 0, i])
             continue
         pull(v, exit_)
-        spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, 0 if apart else block], apart)
-
-
-@njit(entry=True, **FAST)
-def tangent(
-    block,
-    t_net,
-    t_net_x,
-    t_net_y,
-    images,
-    leaving,
-    scratch,
-    first,
-    bu,
-    du,
-    net,
-    net_x,
-    net_y,
-    x,
-    y,
-    along_x,
-    along_y,
-    flux,
-    exit_,
-    frame,
-    splat,
-    oblique,
-):
-    """Derivative of `forward` along (t_net, t_net_x, t_net_y): blocks' images, and leaving powers (blocks,)."""
-    if block == ALL:
-        on_threads(
-            len(images),
-            (
-                t_net,
-                t_net_x,
-                t_net_y,
-                images,
-                leaving,
-                scratch,
-                first,
-                bu,
-                du,
-                net,
-                net_x,
-                net_y,
-                x,
-                y,
-                along_x,
-                along_y,
-                flux,
-                exit_,
-                frame,
-                splat,
-                oblique,
-            ),
-        )
-        return
-    rows, blocks = len(x), len(images)
-    vx, vy = splat.size_x, splat.size_y
-    images[block], leaving[block] = 0.0, 0.0
-    v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
-    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, flux)
-        if oblique is None:
-            _bend(v, i, surface, rays, exit_, frame)
-        else:
-            oblique_refraction.aim(v, _oblique(i, surface, rays), x[i], y[i], exit_, frame)
-        share(v, splat, sx, sy, dx, dy)
-        if oblique is not None:
-            oblique_refraction.push(v, _oblique(i, surface, rays), (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
-        else:
-            combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
-            push(v, exit_, frame)
-        leaving[block] += _scatter_tangent(v, exit_, frame, splat, sx, sy, dx, dy, images[block])
+        spread(i, first, bu, du, v[BY_SAG], v[BY_GX], v[BY_GY], nets[:, 0 if apart else block], apart)

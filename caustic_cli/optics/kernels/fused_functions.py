@@ -1,4 +1,4 @@
-"""The fused kernels as differentiable torch functions: reverse mode by the hand-written adjoint, forward mode by the tangent.
+"""The fused kernels as differentiable torch functions, in reverse mode by the hand-written adjoint.
 
 The surface at the rays (at a tensor product of points, at scattered points, or at intersections) is the input of one kernel that
 refracts, transfers to the screen and splats.  Everything is float64, whatever the precision of the plain-torch reference.
@@ -258,7 +258,6 @@ class _Image(torch.autograd.Function):
     def setup_context(ctx, inputs, output):
         *nets, ctx.rows, ctx.apart, ctx.arguments, ctx.workspace = inputs
         ctx.save_for_backward(*nets)
-        ctx.save_for_forward(*nets)
         ctx.mark_non_differentiable(output[2])
 
     @staticmethod
@@ -267,15 +266,6 @@ class _Image(torch.autograd.Function):
         sums = _adjoint(by_image, float(by_leaving), ctx.saved_tensors, ctx.rows, ctx.apart, ctx.arguments, ctx.workspace)
         nets = (torch.from_numpy(s[0] if ctx.apart else pixels.total(s)) for s in sums)
         return *nets, None, None, None, None
-
-    @staticmethod
-    def jvp(ctx, *tangents):
-        nets = ctx.saved_tensors
-        along = [torch.zeros_like(n) if t is None else t for t, n in zip(tangents[:3], nets, strict=True)]
-        images, scratch = _images(ctx.arguments, ctx.workspace)
-        leaving = np.empty(len(images))
-        fused.tangent(ALL, *_arrays(*along), images, leaving, scratch, *ctx.rows, *_arrays(*nets), *ctx.arguments)
-        return torch.from_numpy(pixels.total(images)), torch.tensor(leaving.sum(), dtype=torch.float64), None
 
 
 def _adjoint(

@@ -1,4 +1,4 @@
-"""The height field on a grid of points: heights -> z and its slopes, with kernels, adjoint and tangent.
+"""The height field on a grid of points: heights -> z and its slopes, with kernels and adjoint.
 
 The fused form of `heightfield.HeightField.prepare` for a tensor product of points: the net is contracted along v once, and each
 row of points then combines p + 1 rows of it, where a product with the dense collocation matrix would use all rows.
@@ -89,7 +89,3 @@ class _Rows(torch.autograd.Function):
         nets, shape = np.empty((3, blocks(), *ctx.shape)), (len(ctx.rows[0]), ctx.shape[1])
         _spread(*(b.contiguous().numpy().reshape(shape) for b in by), *ctx.rows, nets)
         return torch.from_numpy(nets[0, 0]), torch.from_numpy(nets[2, 0]), None
-
-    @staticmethod
-    def jvp(ctx, net, net_y, _):
-        return _Rows.apply(net.detach(), net_y.detach(), ctx.rows)  # within torch.func numbers are within reach only so

@@ -1,6 +1,6 @@
 """The interaction with a smooth surface: refraction with Fresnel losses, or reflection by a mirror.
 
-The fused form of `interface` and `polarisation.s_fraction`, differentiable in reverse and in forward mode by direction, slopes,
+The fused form of `interface` and `polarisation.s_fraction`, differentiable in reverse mode by direction, slopes,
 power and field; formulas are with the kernels, in `refraction` and `mirror`.
 """
 
@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks, mirror, refraction
 from caustic_cli.optics.kernels.axial_refraction import FRESNEL
-from caustic_cli.optics.kernels.stage import components, given, keep, kept, new, tangent, wanted
+from caustic_cli.optics.kernels.stage import components, given, keep, kept, new, wanted
 from caustic_cli.optics.kernels.threads import ALL
 
 
@@ -69,15 +69,6 @@ class _Refraction(torch.autograd.Function):
         refraction.refract_adjoint(ALL, ray, ctx.surface, components(by[:4]), out, count, blocks())
         return *given(ctx, out), None
 
-    @staticmethod
-    def jvp(ctx, *along):
-        def push(ray, along):
-            out = new(4, len(ray[5]))
-            refraction.refract_tangent(ALL, ray, ctx.surface, along, out, len(ray[5]), blocks())
-            return out
-
-        return *tangent(ctx, along, push), None
-
 
 class _Mirror(torch.autograd.Function):
     """d and g by components -> t by components."""
@@ -100,12 +91,3 @@ class _Mirror(torch.autograd.Function):
         out = wanted(ctx, 5, count)
         mirror.reflect_adjoint(ALL, ray, components(by), out, count, blocks())
         return tuple(given(ctx, out))
-
-    @staticmethod
-    def jvp(ctx, *along):
-        def push(ray, along):
-            out = new(3, len(ray[3]))
-            mirror.reflect_tangent(ALL, ray, along, out, len(ray[3]), blocks())
-            return out
-
-        return tangent(ctx, along, push)

@@ -1,4 +1,4 @@
-"""CPU kernels for reflection at a smooth surface, with adjoint and tangent.
+"""CPU kernels for reflection at a smooth surface, with adjoint.
 
 Rays are float64 components, see `stage`; the reference is `interface.reflect`.
 
@@ -7,7 +7,7 @@ Notation, a ray with unit direction d and slopes g of the surface at its hit; N 
     m       2 (d . N) h
     t       d - m N, the same from both sides of the surface
 
-by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.
+by_v is the derivative of whatever is differentiated by v.
 """
 
 from __future__ import annotations
@@ -93,36 +93,3 @@ def reflect_adjoint(block, ray, given, out, count, blocks):
         on_threads(blocks, (ray, given, out, count, blocks))
         return
     _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, given, out)
-
-
-@njit(inline="always", **FAST)
-def push_batch(v, start, count, ray, along, out):
-    """A batch of `reflect_tangent`."""
-    for i in range(5):
-        load(ray[i], start, count, v[i])
-        load(along[i], start, count, v[BY_DX + i])
-    for j in range(count):
-        (h, m), gx, gy, ux, uy = _m(v, j), v[GX, j], v[GY, j], v[BY_GX, j], v[BY_GY, j]
-        d_c = v[BY_DZ, j] - v[BY_DX, j] * gx - v[BY_DY, j] * gy - v[DX, j] * ux - v[DY, j] * uy
-        d_m = 2.0 * h * (d_c - m * (gx * ux + gy * uy))
-        v[BY_TX, j] = v[BY_DX, j] + d_m * gx + m * ux
-        v[BY_TY, j] = v[BY_DY, j] + d_m * gy + m * uy
-        v[BY_TZ, j] = v[BY_DZ, j] - d_m
-    for i in range(3):
-        store(v[BY_TX + i], start, count, out[i])
-
-
-@njit(**FAST)
-def _push_some(begin, end, ray, along, out):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        push_batch(v, start, min(BATCH, end - start), ray, along, out)
-
-
-@njit(entry=True, **FAST)
-def reflect_tangent(block, ray, along, out, count, blocks):
-    """Derivatives of t into `out` along `along`, five components."""
-    if block == ALL:
-        on_threads(blocks, (ray, along, out, count, blocks))
-        return
-    _push_some(block * count // blocks, (block + 1) * count // blocks, ray, along, out)

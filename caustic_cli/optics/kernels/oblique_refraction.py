@@ -31,7 +31,6 @@ from caustic_cli.optics.kernels.axial_refraction import (
     PY,
     SAG,
     SCHLICK,
-    T_POWER,
     load,
 )
 from caustic_cli.optics.kernels.jit import FAST, njit
@@ -184,24 +183,3 @@ def pull(v, ray, exit_, by_reach, by_gx, by_gy):
         _put(w[BY_REACH], start, count, by_reach)
         _put(w[BY_GX], start, count, by_gx)
         _put(w[BY_GY], start, count, by_gy)
-
-
-@njit(**FAST)
-def push(v, ray, along, exit_, frame):
-    """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY; along: those of distance and slopes."""
-    n, fresnel, height, start = exit_.index, exit_.fresnel, exit_.height, exit_.start
-    for j in range(v.shape[1]):
-        t, gx, gy, dt, tx, ty = ray[0][j], ray[1][j], ray[2][j], along[0][j], along[1][j], along[2][j]
-        dx, dy = ray[3][j], ray[4][j]
-        dz, norm2, c, s, _ = _refract(dx, dy, gx, gy, n)
-        _, r_c, r_s, r_norm2 = _reflected(fresnel, c, s, norm2, n)
-        d_norm2, dc = 2.0 * (gx * tx + gy * ty), -dx * tx - dy * ty
-        ds = (d_norm2 * (1.0 - n) * (1.0 + n) / 2.0 + n * n * c * dc) / s
-        gamma = (1.0 - n) * (1.0 + n) / (s + n * c)
-        d_gamma = -gamma * (ds + n * dc) / (s + n * c)
-        down = n * dz + gamma
-        path = (height - start - t * dz) / down
-        d_path = -(dt * dz + path * d_gamma) / down
-        v[T_POWER, j] = -v[FLUX, j] * (r_c * dc + r_s * ds + r_norm2 * d_norm2)
-        v[BY_PX, j] = (dt * dx + d_path * (n * dx - gamma * gx) - path * (d_gamma * gx + gamma * tx)) / frame.pixel_x
-        v[BY_PY, j] = (dt * dy + d_path * (n * dy - gamma * gy) - path * (d_gamma * gy + gamma * ty)) / frame.pixel_y

@@ -41,8 +41,8 @@ def hits_of_rays(
         side: 1 for rays from below, -1 for rays from above.
 
     Returns:
-        t, mm, 0 where there is no hit; dz/dx, dz/dy there; found, bool.  (N,) each; t and slopes are differentiable once, in either
-        mode, by heights, origin and direction.  A ray that starts on the surface or beyond it misses.
+        t, mm, 0 where there is no hit; dz/dx, dz/dy there; found, bool.  (N,) each; t and slopes are differentiable once by
+        heights, origin and direction.  A ray that starts on the surface or beyond it misses.
     """
     if side > 0:
         return _HitsOfRays.apply(heights, *origin, *direction, surface)[:4]
@@ -142,7 +142,6 @@ class _HitsOfRays(torch.autograd.Function):
     def setup_context(ctx, inputs, output):
         *tensors, ctx.surface = inputs
         ctx.save_for_backward(*tensors, *output)
-        ctx.save_for_forward(*tensors, *output)
         ctx.mark_non_differentiable(*output[3:])
 
     @staticmethod
@@ -173,33 +172,3 @@ class _HitsOfRays(torch.autograd.Function):
         out += [a if w else None for a, w in zip(starts, wanted[1:4], strict=True)]
         out += [t * a if w else None for a, w in zip(starts, wanted[4:7], strict=True)]
         return *out, None
-
-    @staticmethod
-    def jvp(ctx, *tangents):
-        heights, ox, oy, oz, dx, dy, dz, t, gx, gy, _, met, where = ctx.saved_tensors
-        surface, by_heights, moves = ctx.surface, tangents[0], [np.empty(0)] * 3
-        ou, ov, _, *directions = _rays(surface, (ox, oy, oz), (dx, dy, dz))
-        c = surface.coefficients(_sag(heights)[0])
-        change = np.empty((0, *c.shape[1:])) if by_heights is None else surface.coefficients(by_heights)
-        if any(m is not None for m in tangents[1:7]):
-            none = torch.zeros_like(t)
-            starts, turns = ([none if m is None else m for m in tangents[k : k + 3]] for k in (1, 4))
-            moves = [(o + t.detach() * d).detach().double().contiguous().numpy() for o, d in zip(starts, turns, strict=True)]
-        out = [torch.empty_like(t) for _ in range(3)]
-        batches.push(
-            ALL,
-            change,
-            *moves,
-            met.numpy(),
-            where.numpy(),
-            ou,
-            ov,
-            *directions,
-            *(a.detach().numpy() for a in (t, gx, gy)),
-            c,
-            *surface.geometry,
-            *surface.scale,
-            *(a.numpy() for a in out),
-            blocks(),
-        )
-        return *out, None, None, None

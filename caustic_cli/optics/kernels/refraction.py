@@ -1,4 +1,4 @@
-"""CPU kernels for refraction at a smooth surface: Snell's law and the Fresnel equations, with adjoint and tangent.
+"""CPU kernels for refraction at a smooth surface: Snell's law and the Fresnel equations, with adjoint.
 
 Rays are float64 components, see `stage`; the reference is `interface` with `polarisation.s_fraction`.  For rays with d . N < 0 the
 normal is reversed.
@@ -15,7 +15,7 @@ Notation, a ray with unit direction d, power P, and slopes g of the surface at i
             R_0 + (1 - R_0) (1 - k)^5 with k = s / |N| if eta > 1, else c / |N| (schlick)
     P'      P (1 - R); 0 where light is totally reflected
 
-by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.
+by_v is the derivative of whatever is differentiated by v.
 """
 
 from __future__ import annotations
@@ -233,62 +233,3 @@ def refract_adjoint(block, ray, surface, given, out, count, blocks):
         on_threads(blocks, (ray, surface, given, out, count, blocks))
         return
     _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, given, out)
-
-
-@njit(inline="always", **FAST)
-def _push(v, count, eta, polarised):
-    """Tangents of t and P', left in their rows, from those of the ray, in the rows of its derivatives."""
-    if polarised:
-        for j in range(count):
-            dx, dy, dz, gx, gy = v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j], v[BY_GX, j], v[BY_GY, j]
-            wx, wy, wz, a, q = _across(v, j)
-            ux, uy = dy + dz * v[GY, j] + v[DZ, j] * gy, -dz * v[GX, j] - v[DZ, j] * gx - dx
-            uz = dy * v[GX, j] + v[DY, j] * gx - dx * v[GY, j] - v[DX, j] * gy
-            d_a = v[BY_EX, j] * wx + v[BY_EY, j] * wy + v[BY_EZ, j] * wz + v[EX, j] * ux + v[EY, j] * uy + v[EZ, j] * uz
-            over = 1.0 / max(q, NORMAL)
-            v[BY_F, j] = 2.0 * a * over * (d_a - a * over * (wx * ux + wy * uy + wz * uz)) if q > NORMAL else 0.0
-    else:
-        for j in range(count):
-            v[BY_F, j] = 0.0
-    for j in range(count):
-        passes, side, c, s, gx, gy = v[PASSES, j], v[SIDE, j], v[C, j], v[S, j], v[GX, j], v[GY, j]
-        dx, dy, dz, tx, ty = v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j], v[BY_GX, j], v[BY_GY, j]
-        d_norm2 = 2.0 * (gx * tx + gy * ty)
-        d_c = side * (dz - dx * gx - dy * gy - v[DX, j] * tx - v[DY, j] * ty)
-        d_s = passes * (0.5 * (1.0 - eta) * (1.0 + eta) * d_norm2 + eta * eta * c * d_c) / s
-        under = 1.0 / (s + eta * c)
-        gamma = side * (1.0 - eta) * (1.0 + eta) * under
-        d_gamma = -gamma * under * (d_s + eta * d_c)
-        d_r = v[R_C, j] * d_c + v[R_S, j] * d_s + v[R_NORM2, j] * d_norm2 + v[R_F, j] * v[BY_F, j]
-        v[BY_TX, j] = eta * dx - d_gamma * gx - gamma * tx
-        v[BY_TY, j] = eta * dy - d_gamma * gy - gamma * ty
-        v[BY_TZ, j] = eta * dz + d_gamma
-        v[BY_AFTER, j] = passes * (v[BY_P, j] * (1.0 - v[R, j]) - v[P, j] * d_r)
-
-
-@njit(inline="always", **FAST)
-def push_batch(v, start, count, ray, surface, along, out):
-    """A batch of `refract_tangent`."""
-    _load(ray, start, count, v)
-    for i in range(9):
-        load(along[i], start, count, v[BY_DX + i])
-    _prepare(v, count, surface)
-    _push(v, count, surface.eta, surface.polarised)
-    for i in range(4):
-        store(v[BY_TX + i], start, count, out[i])
-
-
-@njit(**FAST)
-def _push_some(begin, end, ray, surface, along, out):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        push_batch(v, start, min(BATCH, end - start), ray, surface, along, out)
-
-
-@njit(entry=True, **FAST)
-def refract_tangent(block, ray, surface, along, out, count, blocks):
-    """Derivatives of t and P' into `out` along `along`, nine components."""
-    if block == ALL:
-        on_threads(blocks, (ray, surface, along, out, count, blocks))
-        return
-    _push_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, along, out)

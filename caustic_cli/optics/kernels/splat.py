@@ -1,4 +1,4 @@
-"""Splatting: accumulation of landing points on pixels, with adjoint and tangent.
+"""Splatting: accumulation of landing points on pixels, with adjoint.
 
 The fused form of `reconstruction.splat` for float64 rays.  Each of a fixed number of blocks of rays accumulates its own image, and
 these are added in order, so the result depends on the number of blocks (threads) but not on timing.  Only the scatter to and the
@@ -12,7 +12,7 @@ Notation, in pixels (w = 1)
     W           weight of a ray;  G the derivatives by the padded image's pixels
     image       sum over rays of W o_x o_y a_i a_j on the frame padded by 2 r, less its padding
 
-by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.
+by_v is the derivative of whatever is differentiated by v.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from caustic_cli.optics.kernels.axial_refraction import fraction
 from caustic_cli.optics.kernels.filter_weights import KINDS, pixel_weights
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits, total
-from caustic_cli.optics.kernels.stage import component, components, given, keep, kept, load, store, tangent, wanted
+from caustic_cli.optics.kernels.stage import component, components, given, keep, kept, load, store, wanted
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
@@ -238,44 +238,6 @@ def _splat_adjoint(block, x, y, weight, frame, grad, by_outside, out, blocks):
             store(v[BY_X + k], i * ROW, count, out[k])
 
 
-@njit(**FAST)
-def _scatter_tangent(v, count, frame, sx, sy, dx, dy, image):
-    """Add the tangent of one row's image, with d_x, d_y and d_W in BY_X, BY_Y and BY_W; returns that of the weight outside."""
-    vx, vy, outside = frame.size_x, frame.size_y, 0.0
-    rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
-    for j in range(count):
-        x, y, change = v[PX, j], v[PY, j], v[BY_W, j]
-        if not (x >= low_x and x < high_x and y >= low_y and y < high_y):
-            outside += change
-            continue
-        i, k = math.floor(x) + rx, math.floor(y) + ry
-        over = v[OVER_X, j] * v[OVER_Y, j]
-        move_x, move_y = over * v[W, j] * v[BY_X, j] / frame.wide_x, over * v[W, j] * v[BY_Y, j] / frame.wide_y
-        change = over * change - move_x * v[LEAN_X, j] - move_y * v[LEAN_Y, j]
-        for a in range(vx):
-            along, across = change * sx[a, j] + move_x * dx[a, j], move_y * sx[a, j]
-            for b in range(vy):
-                image[i + a, k + b] += along * sy[b, j] + across * dy[b, j]
-    return outside
-
-
-@njit(entry=True, **FAST)
-def _splat_tangent(block, x, y, weight, frame, along, images, outside):
-    """Derivatives of `_splat`'s images and weights along d_x, d_y and d_W."""
-    rows, blocks = -(-len(x) // ROW), len(images)
-    if block == ALL:
-        on_threads(blocks, (x, y, weight, frame, along, images, outside))
-        return
-    images[block], outside[block] = 0.0, 0.0
-    v, sx, sy, dx, dy, _, _ = _cut(frame)
-    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        count = min(ROW, len(x) - i * ROW)
-        _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx, dy)
-        for k in range(3):
-            load(along[k], i * ROW, count, v[BY_X + k])
-        outside[block] += _scatter_tangent(v, count, frame, sx, sy, dx, dy, images[block])
-
-
 def _shape(frame: PixelFrame) -> tuple[int, int]:
     """Of a padded image, with room for the scatter's last step of four pixels."""
     return frame.pixels_x + 2 * (frame.size_x - 1), frame.pixels_y + 2 * (frame.size_y - 1) + -frame.size_y % 4
@@ -308,12 +270,3 @@ class _Splat(torch.autograd.Function):
         grad = np.zeros(_shape(frame)) if by_image is None else component(by_image)
         _splat_adjoint(ALL, *rays, frame, grad, 0.0 if by_outside is None else float(by_outside), out, blocks())
         return *given(ctx, out), None
-
-    @staticmethod
-    def jvp(ctx, *along):
-        def push(rays, along):
-            images, outside = _room(ctx.frame)
-            _splat_tangent(ALL, *rays, ctx.frame, along, images, outside)
-            return total(images), np.array(outside.sum())
-
-        return tangent(ctx, along, push)

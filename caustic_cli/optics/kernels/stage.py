@@ -8,8 +8,6 @@ float64.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -54,10 +52,9 @@ def components(values) -> tuple[np.ndarray, ...]:
 
 
 def keep(ctx, values: tuple) -> None:
-    """Save components for both modes of differentiation: tensors for torch's bookkeeping, numbers separately."""
+    """Save components for the adjoint: tensors for torch's bookkeeping, numbers separately."""
     tensors = [v if isinstance(v, Tensor) else None for v in values]
     ctx.save_for_backward(*tensors)
-    ctx.save_for_forward(*tensors)
     ctx.numbers = [None if isinstance(v, Tensor) else v for v in values]
     ctx.set_materialize_grads(False)
 
@@ -75,29 +72,6 @@ def wanted(ctx, values: int, count: int) -> tuple[np.ndarray, ...]:
 def new(values: int, count: int) -> tuple[np.ndarray, ...]:
     """Output arrays for `values` components."""
     return tuple(np.empty(count) for _ in range(values))
-
-
-class _Apart(torch.autograd.Function):
-    """A function of arrays that is opaque to torch."""
-
-    @staticmethod
-    def forward(function: Callable, *values):
-        return tuple(torch.from_numpy(a) for a in function(components(values)))
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        pass
-
-
-def tangent(ctx, along: tuple, push: Callable) -> tuple[Tensor, ...]:
-    """The outputs' tangents: arrays that `push` returns, given arrays of the kept components and of as many of `along`.
-
-    It is a function of its own, because within torch.func the data of a tensor is accessible only there.
-    """
-    values = kept(ctx)
-    count = len(values)
-    every = (v.detach() if isinstance(v, Tensor) else v for v in (*values, *along[:count]))
-    return _Apart.apply(lambda arrays: push(arrays[:count], arrays[count:]), *every)
 
 
 def given(ctx, arrays: tuple[np.ndarray, ...]) -> list[Tensor | None]:

@@ -101,10 +101,6 @@ class _ScatteredSurface(torch.autograd.Function):
         spline.pull_back(ALL, u, v, *(g.contiguous().numpy() for g in by), *surface.geometry, *surface.scale, grads)
         return surface.pull(grads).to(ctx.heights_dtype), None, None, None
 
-    @staticmethod
-    def jvp(ctx, tangent, *_):
-        return _ScatteredSurface.forward(tangent, *ctx.rest)
-
 
 def _sag(heights: Tensor) -> tuple[Tensor, float]:
     """Heights (n, m) minus their mean, float64, and the mean, mm: a sag small compared with the thickness keeps all its digits."""
@@ -225,7 +221,6 @@ class _Hits(torch.autograd.Function):
     def setup_context(ctx, inputs, output):
         heights, ctx.rays = inputs
         ctx.save_for_backward(heights, *output)
-        ctx.save_for_forward(heights, *output)
         ctx.mark_non_differentiable(*output[3:])
 
     @staticmethod
@@ -252,28 +247,3 @@ class _Hits(torch.autograd.Function):
             none,
         )
         return surface.pull(grads).to(heights.dtype), None
-
-    @staticmethod
-    def jvp(ctx, tangent, *_):
-        _, *found, met, where, c = ctx.saved_tensors
-        surface, (ou, ov, _, *directions), none = ctx.rays.surface, ctx.rays.rays, np.empty(0)
-        out = [torch.empty(len(met), dtype=torch.float64) for _ in range(3)]
-        batches.push(
-            ALL,
-            surface.coefficients(tangent),
-            none,
-            none,
-            none,
-            met.numpy(),
-            where.numpy(),
-            ou,
-            ov,
-            *directions,
-            *(t.detach().numpy() for t in found),
-            c.numpy(),
-            *surface.geometry,
-            *surface.scale,
-            *(t.numpy() for t in out),
-            blocks(),
-        )
-        return *out, None, None, None

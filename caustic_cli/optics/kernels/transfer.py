@@ -1,4 +1,4 @@
-"""Ray transfer to a plane: the landing points of straight rays, with adjoint and tangent.
+"""Ray transfer to a plane: the landing points of straight rays, with adjoint.
 
 Rays are float64 components, see `stage`; the reference is `backends.reference`.
 
@@ -8,7 +8,7 @@ Notation, a ray from o in direction d, a plane through p with unit vectors a (al
     r       (o - p) + k d
     x, y    r . a and r . b
 
-by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.
+by_v is the derivative of whatever is differentiated by v.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import BATCH, components, given, keep, kept, load, new, store, tangent, wanted
+from caustic_cli.optics.kernels.stage import BATCH, components, given, keep, kept, load, new, store, wanted
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import PARALLEL
 
@@ -152,40 +152,6 @@ def _land_adjoint(block, ray, plane, given, out, count, blocks):
     _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, given, out)
 
 
-@njit(inline="always", **FAST)
-def push_batch(v, start, count, ray, plane, along, out):
-    """A batch of `_land_tangent`."""
-    _, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _ = plane
-    _path(ray, start, count, plane, v)
-    for i in range(6):
-        load(along[i], start, count, v[BY_OX + i])
-    for j in range(count):
-        k = v[K, j]
-        # the hit moves as the point at a fixed k does, and along d back into the plane
-        rx, ry, rz = v[BY_OX, j] + k * v[BY_DX, j], v[BY_OY, j] + k * v[BY_DY, j], v[BY_OZ, j] + k * v[BY_DZ, j]
-        d_k = -(rx * nx + ry * ny + rz * nz) * v[OVER, j] * v[ON_WAY, j]
-        rx, ry, rz = rx + d_k * v[DX, j], ry + d_k * v[DY, j], rz + d_k * v[DZ, j]
-        v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
-    store(v[X], start, count, out[0])
-    store(v[Y], start, count, out[1])
-
-
-@njit(**FAST)
-def _push_some(begin, end, ray, plane, along, out):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        push_batch(v, start, min(BATCH, end - start), ray, plane, along, out)
-
-
-@njit(entry=True, **FAST)
-def _land_tangent(block, ray, plane, along, out, count, blocks):
-    """Derivatives of x and y into `out` along `along`, six components."""
-    if block == ALL:
-        on_threads(blocks, (ray, plane, along, out, count, blocks))
-        return
-    _push_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, along, out)
-
-
 class _Landing(torch.autograd.Function):
     """o and d by components, and the plane -> x, y and whether the ray is on its way."""
 
@@ -210,15 +176,6 @@ class _Landing(torch.autograd.Function):
         out = wanted(ctx, 6, ctx.count)
         _land_adjoint(ALL, components(kept(ctx)), ctx.plane, components((by_x, by_y)), out, ctx.count, blocks())
         return *given(ctx, out), None
-
-    @staticmethod
-    def jvp(ctx, *along):
-        def push(ray, along):
-            out = new(2, ctx.count)
-            _land_tangent(ALL, ray, ctx.plane, along, out, ctx.count, blocks())
-            return out
-
-        return *tangent(ctx, along, push), None
 
 
 def _count(ray) -> int:

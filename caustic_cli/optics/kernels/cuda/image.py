@@ -21,38 +21,35 @@ from caustic_cli.optics.kernels import axial_refraction, filter_weights, fused, 
 from caustic_cli.optics.kernels import oblique_refraction as oblique
 from caustic_cli.optics.kernels.arguments import Exit, ScreenFrame, Splat
 from caustic_cli.optics.kernels.axial_refraction import (
+    BY_GX,
+    BY_GY,
     BY_POWER,
     BY_PX,
     BY_PY,
+    BY_SAG,
     FLUX,
     GX,
     GY,
-    LEAN_X,
-    LEAN_Y,
     OVER_X,
     OVER_Y,
     POWER,
     PX,
     PY,
     SAG,
-    T_GX,
-    T_GY,
-    T_POWER,
-    T_SAG,
     X,
     Y,
 )
 from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.launch import device, start
-from caustic_cli.optics.kernels.cuda.scatter import scatter, scatter_tangent, size_of_tangent, units
+from caustic_cli.optics.kernels.cuda.scatter import scatter, units
 from caustic_cli.optics.kernels.fused import COLUMNS, FRESNEL, LEAVING, MISSED, OFF_SCREEN, REFLECTED
 from caustic_cli.optics.kernels.oblique_refraction import MISSED_POWER
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
 limits, share, gather = device(pixels.limits), device(fused.share), device(fused.gather)
-carry, pull_axial, push_axial = device(fused.carry), device(axial_refraction.pull), device(axial_refraction.push)
-aim_batch, pull_batch, push_oblique = device(oblique._aim), device(oblique._pull), device(oblique.push)
+carry, pull_axial = device(fused.carry), device(axial_refraction.pull)
+aim_batch, pull_batch = device(oblique._aim), device(oblique._pull)
 VECTORS = axial_refraction.VECTORS + axial_refraction.SCRATCH
 
 
@@ -107,30 +104,17 @@ def bend_oblique(v, w, k, hits, rays, exit_, frame):
 
 @device
 def unbend_axial(v, w, exit_):
-    """Derivatives by the surface in T_SAG, T_GX, T_GY."""
+    """Derivatives by the surface in BY_SAG, BY_GX, BY_GY."""
     pull_axial(v, exit_)
 
 
 @device
 def unbend_oblique(v, w, exit_):
-    """Derivatives by distance and slopes in T_SAG, T_GX, T_GY."""
+    """Derivatives by distance and slopes in BY_SAG, BY_GX, BY_GY."""
     w[oblique.OUT_SAG, 0], w[oblique.OUT_POWER, 0] = v[POWER, 0], v[BY_POWER, 0]
     w[oblique.OUT_PX, 0], w[oblique.OUT_PY, 0] = v[BY_PX, 0], v[BY_PY, 0]
     pull_batch(w, 1, exit_)
-    v[T_SAG, 0], v[T_GX, 0], v[T_GY, 0] = w[oblique.BY_REACH, 0], w[oblique.BY_GX, 0], w[oblique.BY_GY, 0]
-
-
-@device
-def move_axial(v, w, exit_, frame):
-    """Tangents of power and landing point in T_POWER, BY_PX, BY_PY, from T_SAG, T_GX, T_GY."""
-    push_axial(v, exit_, frame)
-
-
-@device
-def move_oblique(v, w, exit_, frame):
-    """The same from the tangents of distance and slopes."""
-    ray = (w[oblique.REACH], w[oblique.GX], w[oblique.GY], w[oblique.DX], w[oblique.DY])
-    push_oblique(v, ray, (v[T_SAG], v[T_GX], v[T_GY]), exit_, frame)
+    v[BY_SAG, 0], v[BY_GX, 0], v[BY_GY, 0] = w[oblique.BY_REACH, 0], w[oblique.BY_GX, 0], w[oblique.BY_GY, 0]
 
 
 @device
@@ -144,8 +128,8 @@ def lands(v, frame, height, vx, vy):
 
 @cache
 def _kernels(slanted: bool, kind: int, vx: int, vy: int):
-    """Forward, adjoint and tangent for rays along z or of any direction, and a filter."""
-    bend, unbend, move = (bend_oblique, unbend_oblique, move_oblique) if slanted else (bend_axial, unbend_axial, move_axial)
+    """Forward and adjoint for rays along z or of any direction, and a filter."""
+    bend, unbend = (bend_oblique, unbend_oblique) if slanted else (bend_axial, unbend_axial)
     ray_rows, room = oblique.ROWS if slanted else 1, vy + -vy % 4
 
     @cuda.jit
@@ -197,40 +181,9 @@ def _kernels(slanted: bool, kind: int, vx: int, vy: int):
             share(v, splat, sx, sy, dx, dy)
             gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, by_leaving[0], column, tilt)
             unbend(v, w, exit_)
-            by_t[k], by_gx[k], by_gy[k] = v[T_SAG, 0], v[T_GX, 0], v[T_GY, 0]
+            by_t[k], by_gx[k], by_gy[k] = v[BY_SAG, 0], v[BY_GX, 0], v[BY_GY, 0]
 
-    @cuda.jit
-    def tangent(hits, along, rays, setting, place, unit, sizes, image, leaving):
-        """Each ray's part of the bound into `sizes`; or, where that is empty, adds to `image` and `leaving` in units."""
-        v, w = cuda.local.array((VECTORS, 1), float64), cuda.local.array((ray_rows, 1), float64)
-        sx, dx = cuda.local.array((vx, 1), float64), cuda.local.array((vx, 1), float64)
-        sy, dy = cuda.local.array((vy, 1), float64), cuda.local.array((vy, 1), float64)
-        exit_, frame = Exit(setting.index, setting.fresnel, place[0], place[1]), setting.frame
-        splat, (d_t, d_gx, d_gy) = Splat(kind, vx, vy, setting.alpha_x, setting.alpha_y), along
-        for k in range(cuda.grid(1), len(rays[4]), cuda.gridsize(1)):
-            bend(v, w, k, hits, rays, exit_, frame)
-            v[T_SAG, 0], v[T_GX, 0], v[T_GY, 0] = d_t[k], d_gx[k], d_gy[k]
-            weight, size = v[POWER, 0], 0.0
-            if weight >= 0.0:
-                move(v, w, exit_, frame)
-                change = v[T_POWER, 0]
-                size = abs(change)
-                if not len(sizes):
-                    cuda.atomic.add(leaving, 0, units(change, unit[0]))
-                inside, i, j = lands(v, frame, exit_.height, vx, vy)
-                if inside:
-                    share(v, splat, sx, sy, dx, dy)
-                    over = v[OVER_X, 0] * v[OVER_Y, 0]
-                    move_x, move_y = over * weight * v[BY_PX, 0], over * weight * v[BY_PY, 0]
-                    change = over * change - move_x * v[LEAN_X, 0] - move_y * v[LEAN_Y, 0]
-                    if len(sizes):
-                        size += size_of_tangent(change, move_x, move_y, sx, sy, dx, dy)
-                    else:
-                        scatter_tangent(image, i, j, change, move_x, move_y, sx, sy, dx, dy, unit[0])
-            if len(sizes):
-                sizes[k] = size
-
-    return forward, adjoint, tangent
+    return forward, adjoint
 
 
 class Splatting(NamedTuple):
@@ -288,7 +241,6 @@ class _Image(torch.autograd.Function):
     def setup_context(ctx, inputs, output):
         *hits, ctx.how = inputs
         ctx.save_for_backward(*hits)
-        ctx.save_for_forward(*hits)
         ctx.mark_non_differentiable(output[2])
 
     @staticmethod
@@ -299,28 +251,3 @@ class _Image(torch.autograd.Function):
         grad, by = by_image.contiguous(), by_leaving.reshape(1)
         start(how.kernels[1], len(hits[0]), hits, how.light.rays, how.setting, how.place, grad, by, out)
         return *out, None
-
-    @staticmethod
-    def jvp(ctx, *along):
-        hits = ctx.saved_tensors
-        moves = (torch.zeros_like(h) if a is None else a for h, a in zip(hits, along[:3], strict=True))
-        return *_Pushed.apply(ctx.how, *(v.detach() for v in (*hits, *moves))), None
-
-
-class _Pushed(torch.autograd.Function):
-    """The tangent of `_Image`, a separate function because within torch.func the data of a tensor is accessible only there."""
-
-    @staticmethod
-    def forward(how: Splatting, *values):
-        hits, along = (tuple(v.contiguous() for v in part) for part in (values[:3], values[3:]))
-        image = torch.zeros(how.shape, dtype=torch.int64, device=hits[0].device)
-        sizes, leaving = torch.zeros_like(hits[0]), image.new_zeros(1)
-        given = (hits, along, how.light.rays, how.setting, how.place)
-        start(how.kernels[2], len(sizes), *given, how.unit, sizes, image, leaving)
-        unit = sums.unit_of(sizes.sum())
-        start(how.kernels[2], len(sizes), *given, unit, sizes[:0], image, leaving)
-        return sums.value_of(image, unit), sums.value_of(leaving, unit)[0].clone()
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        pass

@@ -1,4 +1,4 @@
-"""CUDA kernels of the stages ray by ray: refraction, reflection and transfer to a plane, with adjoint and tangent.
+"""CUDA kernels of the stages ray by ray: refraction, reflection and transfer to a plane, with adjoint.
 
 The functions of `kernels.refraction`, `kernels.mirror` and `kernels.transfer`, a batch of one ray at a time.
 """
@@ -16,11 +16,9 @@ from caustic_cli.optics.kernels import mirror, refraction, transfer
 from caustic_cli.optics.kernels.axial_refraction import FRESNEL
 from caustic_cli.optics.kernels.cuda.launch import device, start
 
-refract_batch, refract_pull, refract_push = (
-    device(f) for f in (refraction.refract_batch, refraction.pull_batch, refraction.push_batch)
-)
-mirror_batch, mirror_pull, mirror_push = (device(f) for f in (mirror.reflect_batch, mirror.pull_batch, mirror.push_batch))
-land_batch, land_pull, land_push = (device(f) for f in (transfer.land_batch, transfer.pull_batch, transfer.push_batch))
+refract_batch, refract_pull = device(refraction.refract_batch), device(refraction.pull_batch)
+mirror_batch, mirror_pull = device(mirror.reflect_batch), device(mirror.pull_batch)
+land_batch, land_pull = device(transfer.land_batch), device(transfer.pull_batch)
 #: Rows of a batch's scratch, as numba wants the sizes of local arrays: names of numbers.
 REFRACTION, MIRROR, TRANSFER = refraction.ROWS, mirror.ROWS, transfer.ROWS
 
@@ -40,13 +38,6 @@ def _refract_adjoint(count, ray, surface, given, out):
 
 
 @cuda.jit
-def _refract_tangent(count, ray, surface, along, out):
-    v = cuda.local.array((REFRACTION, 1), float64)
-    for k in range(cuda.grid(1), count, cuda.gridsize(1)):
-        refract_push(v, k, 1, ray, surface, along, out)
-
-
-@cuda.jit
 def _reflect(count, ray, surface, out, passes):
     v = cuda.local.array((MIRROR, 1), float64)
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
@@ -59,13 +50,6 @@ def _reflect_adjoint(count, ray, surface, given, out):
     v = cuda.local.array((MIRROR, 1), float64)
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         mirror_pull(v, k, 1, ray, given, out)
-
-
-@cuda.jit
-def _reflect_tangent(count, ray, surface, along, out):
-    v = cuda.local.array((MIRROR, 1), float64)
-    for k in range(cuda.grid(1), count, cuda.gridsize(1)):
-        mirror_push(v, k, 1, ray, along, out)
 
 
 @cuda.jit
@@ -82,19 +66,11 @@ def _land_adjoint(count, ray, surface, given, out):
         land_pull(v, k, 1, ray, surface, given, out)
 
 
-@cuda.jit
-def _land_tangent(count, ray, surface, along, out):
-    v = cuda.local.array((TRANSFER, 1), float64)
-    for k in range(cuda.grid(1), count, cuda.gridsize(1)):
-        land_push(v, k, 1, ray, surface, along, out)
-
-
 class RayStage(NamedTuple):
     """Kernels, number of output components besides a boolean one, and further arguments of the kernels."""
 
     forward: object
     adjoint: object
-    tangent: object
     outputs: int
     surface: tuple
 
@@ -102,11 +78,11 @@ class RayStage(NamedTuple):
 def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, field=None):
     """`kernels.interact.interact` of tensors on the device."""
     if reflects:
-        *t, passes = _Stage.apply(RayStage(_reflect, _reflect_adjoint, _reflect_tangent, 3, ()), *direction, *slopes)
+        *t, passes = _Stage.apply(RayStage(_reflect, _reflect_adjoint, 3, ()), *direction, *slopes)
         return tuple(t), power, passes
     polarised = field is not None and fresnel == "exact"
     surface = refraction.Interface(float(eta), FRESNEL[fresnel], polarised)
-    stage = RayStage(_refract, _refract_adjoint, _refract_tangent, 4, surface)
+    stage = RayStage(_refract, _refract_adjoint, 4, surface)
     *t, after, passes = _Stage.apply(stage, *direction, *slopes, power, *(field if polarised else (0.0, 0.0, 0.0)))
     return tuple(t), after, passes
 
@@ -114,7 +90,7 @@ def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fr
 def land(origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
     """`kernels.transfer.land` of tensors on the device."""
     plane = transfer.TargetPlane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
-    return _Stage.apply(RayStage(_land, _land_adjoint, _land_tangent, 2, plane), *origin, *direction)
+    return _Stage.apply(RayStage(_land, _land_adjoint, 2, plane), *origin, *direction)
 
 
 class _Stage(torch.autograd.Function):
@@ -133,7 +109,6 @@ class _Stage(torch.autograd.Function):
         ctx.stage, *ray = inputs
         tensors = [v if isinstance(v, Tensor) else None for v in ray]
         ctx.save_for_backward(*tensors)
-        ctx.save_for_forward(*tensors)
         ctx.numbers = [None if isinstance(v, Tensor) else v for v in ray]
         ctx.mark_non_differentiable(output[-1])
 
@@ -145,26 +120,6 @@ class _Stage(torch.autograd.Function):
         out = tuple(torch.empty_like(like) if w else like.new_empty(0) for w in wanted)
         start(stage.adjoint, len(like), len(like), _components(ray, like), stage.surface, _components(by[:-1], like), out)
         return None, *(a if w else None for a, w in zip(out, wanted, strict=True))
-
-    @staticmethod
-    def jvp(ctx, _, *along):
-        values = (v.detach() if isinstance(v, Tensor) else v for v in (*_kept(ctx), *along))
-        return *_Pushed.apply(ctx.stage, *values), None
-
-
-class _Pushed(torch.autograd.Function):
-    """The tangent of `_Stage`, a separate function because within torch.func the data of a tensor is accessible only there."""
-
-    @staticmethod
-    def forward(stage: RayStage, *values):
-        ray, along, like = values[: len(values) // 2], values[len(values) // 2 :], _like(values)
-        out = tuple(torch.empty_like(like) for _ in range(stage.outputs))
-        start(stage.tangent, len(like), len(like), _components(ray, like), stage.surface, _components(along, like), out)
-        return out
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        pass
 
 
 def _kept(ctx) -> tuple:

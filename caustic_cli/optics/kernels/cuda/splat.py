@@ -1,4 +1,4 @@
-"""CUDA kernel for splatting: accumulation of landing points on pixels, with adjoint and tangent.
+"""CUDA kernel for splatting: accumulation of landing points on pixels, with adjoint.
 
 The functions of `kernels.splat`, with their notation; a row of one ray at a time.
 """
@@ -16,9 +16,9 @@ from torch.autograd.function import once_differentiable
 from caustic_cli.optics.kernels import pixels, splat
 from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.launch import device, start
-from caustic_cli.optics.kernels.cuda.scatter import scatter, scatter_tangent, size_of_tangent, units
+from caustic_cli.optics.kernels.cuda.scatter import scatter, units
 from caustic_cli.optics.kernels.filter_weights import KINDS
-from caustic_cli.optics.kernels.splat import BY_W, BY_X, BY_Y, LEAN_X, LEAN_Y, OVER_X, OVER_Y, PX, PY, PixelFrame, W
+from caustic_cli.optics.kernels.splat import BY_W, BY_X, BY_Y, OVER_X, OVER_Y, PX, PY, PixelFrame, W
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
@@ -48,7 +48,7 @@ def lands(v, frame):
 
 @cache
 def _kernels(kind: int, vx: int, vy: int):
-    """Forward, adjoint and tangent for a filter."""
+    """Forward and adjoint for a filter."""
     room = vy + -vy % 4
 
     @cuda.jit
@@ -81,30 +81,7 @@ def _kernels(kind: int, vx: int, vy: int):
             gather(v, 1, frame, sx, sy, dx, dy, grad, by_outside[0], column, tilt)
             by_x[k], by_y[k], by_w[k] = v[BY_X, 0], v[BY_Y, 0], v[BY_W, 0]
 
-    @cuda.jit
-    def tangent(rays, along, any_frame, unit, sizes, image, outside):
-        """Each ray's part of the bound into `sizes`; or, where that is empty, adds to `image` and `outside` in units."""
-        (x, y, weight), (d_x, d_y, d_w), f = rays, along, any_frame
-        frame = PixelFrame(f.pixels_x, f.pixels_y, f.low_x, f.low_y, f.wide_x, f.wide_y, kind, vx, vy, f.alpha_x, f.alpha_y)
-        v = cuda.local.array((VECTORS, 1), float64)
-        sx, dx = cuda.local.array((vx, 1), float64), cuda.local.array((vx, 1), float64)
-        sy, dy = cuda.local.array((vy, 1), float64), cuda.local.array((vy, 1), float64)
-        for k in range(cuda.grid(1), len(x), cuda.gridsize(1)):
-            aim(x, y, weight, k, 1, frame, v, sx, sy, dx, dy)
-            inside, i, j = lands(v, frame)
-            change, move_x, move_y = d_w[k], 0.0, 0.0
-            if inside:
-                over = v[OVER_X, 0] * v[OVER_Y, 0]
-                move_x, move_y = over * v[W, 0] * d_x[k] / frame.wide_x, over * v[W, 0] * d_y[k] / frame.wide_y
-                change = over * change - move_x * v[LEAN_X, 0] - move_y * v[LEAN_Y, 0]
-            if len(sizes):
-                sizes[k] = size_of_tangent(change, move_x, move_y, sx, sy, dx, dy) if inside else abs(change)
-            elif inside:
-                scatter_tangent(image, i, j, change, move_x, move_y, sx, sy, dx, dy, unit[0])
-            else:
-                cuda.atomic.add(outside, 0, units(change, unit[0]))
-
-    return forward, adjoint, tangent
+    return forward, adjoint
 
 
 def _shape(frame: PixelFrame) -> tuple[int, int]:
@@ -130,7 +107,6 @@ class _Splat(torch.autograd.Function):
     def setup_context(ctx, inputs, output):
         *rays, ctx.frame = inputs
         ctx.save_for_backward(*rays)
-        ctx.save_for_forward(*rays)
 
     @staticmethod
     @once_differentiable
@@ -139,27 +115,3 @@ class _Splat(torch.autograd.Function):
         out = tuple(torch.empty_like(rays[0]) for _ in range(3))
         start(_kernels(*frame[6:9])[1], len(rays[0]), rays, frame, by_image.contiguous(), by_outside.reshape(1), out)
         return *(a.to(r.dtype) if w else None for a, r, w in zip(out, ctx.saved_tensors, ctx.needs_input_grad, strict=False)), None
-
-    @staticmethod
-    def jvp(ctx, *along):
-        rays = ctx.saved_tensors
-        moves = (torch.zeros_like(r) if a is None else a for r, a in zip(rays, along[:3], strict=True))
-        return _Pushed.apply(ctx.frame, *(v.detach() for v in (*rays, *moves)))
-
-
-class _Pushed(torch.autograd.Function):
-    """The tangent of `_Splat`, a separate function because within torch.func the data of a tensor is accessible only there."""
-
-    @staticmethod
-    def forward(frame: PixelFrame, *values):
-        rays, along = _whole(values[:3]), _whole(values[3:])
-        image = torch.zeros(_shape(frame), dtype=torch.int64, device=rays[0].device)
-        sizes, outside, kernel = torch.zeros_like(rays[0]), image.new_zeros(1), _kernels(*frame[6:9])[2]
-        start(kernel, len(sizes), rays, along, frame, sums.unit_of(sizes.sum()), sizes, image, outside)
-        unit = sums.unit_of(sizes.sum())
-        start(kernel, len(sizes), rays, along, frame, unit, sizes[:0], image, outside)
-        return sums.value_of(image, unit), sums.value_of(outside, unit)[0].clone()
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        pass

@@ -24,9 +24,8 @@ from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.launch import device, start
 from caustic_cli.optics.kernels.intersect import HIT
 
-piece, jet, push_powers, value_at = (device(f) for f in (spline.piece, spline.jet, spline.push_powers, intersect._value))
-first_hit, beyond = device(batches.first_hit), device(batches.beyond)
-pull_alone, push_alone = device(batches.pull_alone), device(batches.push_alone)
+piece, push_powers, value_at = (device(f) for f in (spline.piece, spline.push_powers, intersect._value))
+first_hit, beyond, pull_alone = device(batches.first_hit), device(batches.beyond), device(batches.pull_alone)
 enter_alone, units = device(ray_intersections.enter_alone), device(sums.units)
 
 
@@ -169,7 +168,6 @@ class _AtPoints(torch.autograd.Function):
         heights, ctx.surface, u, v = inputs
         ctx.dtype = heights.dtype
         ctx.save_for_backward(u, v, output[3])
-        ctx.save_for_forward(u, v)
         ctx.mark_non_differentiable(output[3])
 
     @staticmethod
@@ -177,11 +175,6 @@ class _AtPoints(torch.autograd.Function):
     def backward(ctx, by_z, by_x, by_y, _):
         u, v, where = ctx.saved_tensors
         return ctx.surface.pull_points(u, v, where, *(b.contiguous() for b in (by_z, by_x, by_y))).to(ctx.dtype), None, None, None
-
-    @staticmethod
-    def jvp(ctx, tangent, *_):
-        u, v, *_ = ctx.saved_tensors
-        return *_AtPoints.apply(tangent.detach(), ctx.surface, u, v)[:3], None  # within torch.func numbers are within reach only so
 
 
 # Ray intersections.
@@ -238,39 +231,6 @@ def _pull_rays(rays, found, where, given, geometry, scale, c, out):
         by_x[k], by_y[k], by_z[k] = along * scale_x + up * gx[k], across * scale_y + up * gy[k], up
 
 
-@cuda.jit
-def _push_rays(rays, found, where, change, move, geometry, scale, c, out):
-    (ox, oy, dx, dy, dz), (t, gx, gy), (move_x, move_y, move_z) = rays, found, move
-    (_, mu, wu, _, mv, wv), (scale_x, scale_y), (d_t, d_gx, d_gy) = geometry, scale, out
-    wide = len(mv)
-    for k in range(cuda.grid(1), len(t), cuda.gridsize(1)):
-        d_t[k], d_gx[k], d_gy[k] = 0.0, 0.0, 0.0
-        if where[k] < 0:
-            continue
-        i, j = where[k] // wide, where[k] % wide
-        du, dv = dx[k] * scale_x, dy[k] * scale_y
-        xi, eta = (
-            (ox[k] * scale_x + 0.5 + t[k] * du - mu[i]) * wu[i],
-            (oy[k] * scale_y + 0.5 + t[k] * dv - mv[j]) * wv[j],
-        )
-        d_t[k], d_gx[k], d_gy[k] = push_alone(
-            c,
-            i,
-            j,
-            xi,
-            eta,
-            wu[i],
-            wv[j],
-            jet(change, i, j, xi, eta),
-            (move_x[k], move_y[k], move_z[k]),
-            (du, dv, dz[k]),
-            gx[k],
-            gy[k],
-            scale_x,
-            scale_y,
-        )
-
-
 def hits_of_rays(
     surface: DeviceSurface, heights: Tensor, origin, direction, *, side: float = 1.0, radius: float | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -314,7 +274,6 @@ class _Hits(torch.autograd.Function):
     def setup_context(ctx, inputs, output):
         *tensors, ctx.surface, _ = inputs
         ctx.save_for_backward(*tensors, *output)
-        ctx.save_for_forward(*tensors, *output)
         ctx.mark_non_differentiable(*output[3:])
 
     @staticmethod
@@ -337,31 +296,6 @@ class _Hits(torch.autograd.Function):
             None,
             None,
         )
-
-    @staticmethod
-    def jvp(ctx, *along):
-        heights, ox, oy, _, dx, dy, dz, t, gx, gy, _, where = ctx.saved_tensors
-        rest = [torch.zeros_like(v) if a is None else a for a, v in zip(along[1:7], (ox, ox, ox, dx, dx, dx), strict=True)]
-        change = torch.zeros_like(heights) if along[0] is None else along[0]
-        values = (heights, ox, oy, dx, dy, dz, t, gx, gy, where, change, *rest)
-        return *_Pushed.apply(ctx.surface, *(v.detach() for v in values)), None, None
-
-
-class _Pushed(torch.autograd.Function):
-    """The tangent of `_Hits`, a separate function because within torch.func the data of a tensor is accessible only there."""
-
-    @staticmethod
-    def forward(surface: DeviceSurface, heights, ox, oy, dx, dy, dz, t, gx, gy, where, change, *moves):
-        c, change = surface.coefficients(_sag(heights)[0]), surface.coefficients(change.double())
-        move = tuple(o + t * d for o, d in zip(moves[:3], moves[3:], strict=True))
-        out = tuple(torch.empty_like(t) for _ in range(3))
-        rays = _whole((ox, oy, dx, dy, dz))
-        start(_push_rays, len(t), rays, (t, gx, gy), where, change, move, surface.geometry, surface.scale, c, out)
-        return out
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        pass
 
 
 def _whole(values) -> tuple[Tensor, ...]:
