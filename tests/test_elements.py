@@ -397,7 +397,7 @@ def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
 @pytest.fixture
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True final_rays=200000")
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test final_rays=200000")
     light = picture()
     Image.fromarray((255 * light / light.max()).astype(np.uint8).T[::-1]).save("one.png")
 
@@ -446,7 +446,7 @@ def test_a_flat_mirror_excludes_nothing_that_a_lens_has_by_itself(_here, capfd):
     """Neither page, report, tolerances, a grid for Zemax, studies, ray files nor designs that are robust or on the wave image; a
     curved mirror does."""
     flat, curved = ("--element", "mirror z=150 tilt=45,0"), ("--element", "mirror z=150 tilt=45,0 radius=-2000")
-    Path("t.toml").write_text("[index]\nsigma = 0.001\n")
+    Path("t.toml").write_text("draws = 40\n[index]\nsigma = 0.001\n")
     Path("led.tm25ray").write_bytes(tm25(*cone_of(20_000, 8.0, seed=1)))
     led = ("--source", "rays", "--source-file", "led.tm25ray", "--source-position", "0,0,-40")
     made = run(capfd, "design", "one.png", *SMALL, *led, *flat, "--iterations", "2", "-o", "led")
