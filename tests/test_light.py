@@ -183,7 +183,7 @@ def test_a_verdict_says_the_error_of_its_wavelengths(_here, capfd):
     capfd.readouterr()
     assert cli.run(["render", "p", "--rays", "4000", "--effects", "diffraction", "--json", "--quiet"]) == 0
     said = dict(figures_rows(json.loads(capfd.readouterr().out)))["relative RMS error"]
-    assert f"whose number leaves an error of {figures['wave_spectral_error']:.1g}" in said
+    assert said.endswith(f"± {figures['wave_spectral_error']:.1g} by their number")
     lines = replace(lens, scene=replace(lens.scene, light=Light(None, (500.0, 600.0)))).render_waves().figures
     assert lines["wave_spectral_error"] is None and lines["wave_spectrum"] is None
 

@@ -286,9 +286,9 @@ def _wavelengths(figures: dict) -> str:
     values, spectrum, beside = figures["wave_wavelengths"], figures.get("wave_spectrum"), figures.get("wave_unseen_relative_rms")
     at = f"{values[0]:.4g} nm" if len(values) == 1 else f"{len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
     if spectrum is not None:
-        rest = figures.get("wave_spectral_error")
-        at += "" if rest is None else f", whose number leaves an error of {rest:.1g}"
-        return f"at {at}, of the spectrum {spectrum} by {'the eye' if figures['wave_detector'] == 'eye' else 'power'}"
+        rest, seen = figures.get("wave_spectral_error"), "the eye" if figures["wave_detector"] == "eye" else "power"
+        sure = "" if rest is None else f"; ± {rest:.1g} by their number"
+        return f"at {at}, of the spectrum {spectrum} by {seen}{sure}"
     return f"at {at}" if beside is None else f"at {at}, those of the design; {beside:.4f} at wavelengths 1 % beside"
 
 
