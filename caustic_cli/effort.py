@@ -152,7 +152,7 @@ FINE = Effort(
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 64, 4_000_000, 4, ((1.0, 200),)),
     wave_colours=8,
-    wave_iterations=(30, 30),
+    wave_iterations=(26, 26),
     wave_seconds=90.0,
 )
 TEST = replace(
