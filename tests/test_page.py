@@ -17,10 +17,11 @@ from helpers import write_blob
 from rayfiles import cone_of, tm25
 
 from caustic_cli import cli, load
-from caustic_cli.export.page import MOST, PAGE, _coded, _onto, write_page
+from caustic_cli.export.page import MOST, PAGE, _coded, _lights, _onto, write_page
 from caustic_cli.io.colorimetry import _into_gamut, rgb_matrix
 from caustic_cli.io.files import is_ours
-from caustic_cli.scene import Screen
+from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
+from caustic_cli.scene.sources.several import light_of_all, together
 from caustic_cli.studies.metrics import relative_rms
 
 #: Relative RMS by which page and render may differ; render's own noise is part of it.
@@ -236,3 +237,13 @@ def test_the_page_keeps_colours_in_the_gamut_as_images_do():
     program = "\n".join([*needed, f"console.log(JSON.stringify({colours.tolist()}.map(intoGamut)))"])
     found = json.loads(subprocess.run(["node", "-e", program], capture_output=True, text=True, check=True).stdout)
     np.testing.assert_allclose(found, _into_gamut(colours), rtol=0, atol=1e-6)
+
+
+def test_sources_of_which_one_has_no_colour_are_shown_in_grey():
+    """One lamp is seen by the eye, the other measured by its power: neither is coloured on the page."""
+    tables = [{"type": "plane", "power": 1.0, "spectrum": "halogen", "detector": d} for d in ("eye", "power")]
+    lens = Lens((2.0, 2.0), control=(9, 9), glass="N-SF11", index=1.7847)
+    source = together((PlaneWave(1.0), PlaneWave(1.0)), [light_of_all(one) for one in tables])
+    scene = Scene(source, lens, Screen((12.0, 12.0), 60.0, (24, 24)), light_of_all(tables[0] | {"also": tables[1:]}))
+    assert scene.white is None and any(band.colour for band in scene.bands)
+    assert all(colour is None for light in _lights(scene) for _, _, colour in light["indices"])

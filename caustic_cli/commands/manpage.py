@@ -129,8 +129,13 @@ The same quantities for a second picture behind the first; if the light is to co
 .BR angle_rms_mrad ,
 the root mean square of its angular deviation.
 .TP
+.B wave_wavelengths, wave_spectrum, wave_detector, wave_spectral_error
+Wavelengths of the wave image, nm; the continuous spectrum that they represent and by what it is measured, eye or power, null for
+spectral lines; and an estimate of the error of wave_relative_rms that their number leaves.
+.TP
 .B start_error, start_relative_rms, start_noise
-The same quantities for the initial surface of a design, by the same rays.
+The same quantities for the initial surface of a design, by the same rays; by waves (start_wave_relative_rms), where it is clearly
+worse than the finished lens, at the wavelengths of the design.
 .TP
 .B tolerances
 For a tolerance study: draws, error_by, percentiles p5, p50 and p95 of error (as placed; also as relative_rms),

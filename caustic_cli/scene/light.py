@@ -23,7 +23,8 @@ RGB = (611.4, 549.1, 464.3)
 #: Largest number of wavelengths of one source: each takes a trace.
 MAX_WAVELENGTHS = 99
 #: Wavelengths that represent a continuous spectrum: as traced through a dispersive glass, and in the verdict on a wave image, where
-#: they are others than those of any design and give the error of 51 within 0.7 % (`tests/benchmarks/wavelengths.py`).
+#: they are more than 2 nm from those of a standard or fine design and give the error of 51 within 0.7 %
+#: (`tests/benchmarks/wavelengths.py`).
 RAY_NODES, WAVE_NODES = 5, 12
 
 

@@ -239,7 +239,7 @@ def _lights(scene: Scene) -> list[dict]:
         for index in dict.fromkeys(band.scene.lens.inside for band in bands):
             same = [band for band in bands if band.scene.lens.inside == index]
             weights = np.array([band.weight for band in same])
-            colours = [band.colour for band in same if band.colour is not None]
+            colours = [band.colour for band in same if band.colour is not None and scene.white is not None]
             mean = _primaries(scene, weights @ np.array(colours) / weights.sum()).tolist() if colours else None
             indices[index] = (weights.sum() / total, mean)
         lights.append(
