@@ -94,7 +94,7 @@ def test_gradient_of_the_loss(source, how):
     difference = (made(moved + step * along).loss - made(moved - step * along).loss) / (2 * step)
     assert float((found.gradient * along).sum()) == pytest.approx(difference, rel=2e-5)
     assert 0.1 < found.on_screen < 1.0
-    made.keeps_graphs = not made.keeps_graphs
+    made.keeps = not made.keeps
     again = made(moved)
     assert again.loss == pytest.approx(found.loss, rel=1e-12)
     assert torch.allclose(again.gradient, found.gradient, rtol=1e-9, atol=1e-12 * float(found.gradient.abs().max()))
@@ -177,7 +177,7 @@ def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
     design(capfd, "blob.png", *small, *extra, "-o", "p")
     tables = workflow.Project.open("p").settings.design.stages
     assert any(t.waves for t in tables) == stages
-    assert not stages or [len(t.waves) for t in tables if t.waves] == [STANDARD.wave_colours] * len(STANDARD.wave_iterations)
+    assert not stages or [len(t.waves) for t in tables if t.waves] == [count for count, _ in STANDARD.waves]
 
 
 OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"
@@ -238,9 +238,9 @@ def test_a_design_on_waves_alone_has_no_rays_to_compare_others_on():
 
 
 def test_time_bounds_the_stages():
-    assert wave_refinement(1e6, 0) == [(5, n) for n in STANDARD.wave_iterations]
-    fewer = wave_refinement(1e7, 0)
-    assert 0 < sum(n for _, n in fewer) < sum(STANDARD.wave_iterations) and all(n >= LEAST_WAVES for _, n in fewer)
+    assert tuple(wave_refinement(1e6, 0)) == STANDARD.waves
+    fewer = wave_refinement(3e7, 0)
+    assert 0 < sum(n for _, n in fewer) < sum(n for _, n in STANDARD.waves) and all(n >= LEAST_WAVES for _, n in fewer)
     assert wave_refinement(1e9, 0) == [] and len(wave_refinement(1e9, 0, timed=False)) == 2
     with pytest.raises(InputError, match="waves"):
         completion.complete({"design": {"waves": "perhaps"}}, 1.0)

@@ -30,7 +30,7 @@ from caustic_cli.schema.table import check_all
 
 
 class Skipped(CausticError):
-    """A stage that cannot be done, and is left out; reason: of its end."""
+    """A stage that cannot be done, or is not needed, and is left out; reason: of its end."""
 
     def __init__(self, words: str, reason: str):
         super().__init__(words)

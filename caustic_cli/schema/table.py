@@ -413,6 +413,7 @@ class StageSettings(Section):
             default=False, written=False)
     lenslets: bool = setting("array: compare the image of every lenslet with its own picture, with its share of the rays",
             default=False, written=False)
+    spare: bool = setting("leave this stage out if a later one can refine the wave image", default=False, written=False)
     oversample: int = setting("subdivide pixels for the filter by this factor, and sum them: sharper than the filter on pixels",
             low=1, high=8, default=1)
     blur: float = setting("blur of render and target in the loss", "pixels", 0.0, 1000.0, default=0.0)
