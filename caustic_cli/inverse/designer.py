@@ -18,7 +18,7 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.lbfgs import UNFIT
+from caustic_cli.inverse.lbfgs import UNFIT, curvature
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import Heights
@@ -253,7 +253,9 @@ class Designer:
             return replace(state, stage=k, iteration=0, optimizer={})
         if not self.options.parametrisation.free:
             raise InputError("⟨design.stages.control⟩ cannot change between stages of a network")
-        return replace(state, stage=k, iteration=0, parameters={}, optimizer={}, heights=self._carried(state.heights, k - 1, k))
+        heights = self._carried(state.heights, k - 1, k)
+        kept = curvature(state.optimizer) if self.problem.carries_curvature(k) else {}
+        return replace(state, stage=k, iteration=0, parameters={}, optimizer=kept, heights=heights)
 
     def _carried(self, heights: Tensor, source: int, destination: int) -> Tensor:
         """The same surface on the control net of another stage."""

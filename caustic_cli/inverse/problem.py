@@ -184,6 +184,10 @@ class Problem:
         same = self.stages[k].control == self.stages[k - 1].control
         return same and (not self.options.parametrisation.free or self.options.optimizer == "adam")
 
+    def carries_curvature(self, k: int) -> bool:
+        """Whether stage k begins with the curvature that the optimiser of the stage before has found."""
+        return False
+
     def objective(self, k: int, initial: Tensor) -> LossOfHeights:
         """The loss of stage k, for heights near `initial`."""
         return self.objective_in(self.scene, k, initial)

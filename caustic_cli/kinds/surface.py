@@ -275,6 +275,10 @@ class OneSurface(Problem):
         by_rays = not (self.stages[k].waves or self.stages[k - 1].waves)
         return super().carries_parameters(k) and (by_rays or not self.options.parametrisation.free)
 
+    def carries_curvature(self, k: int) -> bool:
+        before, stage = self.stages[k - 1 : k + 1]
+        return bool(before.waves and stage.waves) and before.control == stage.control
+
     def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
         return QuasiNewton if self.stages[k].waves else super().optimiser(k)
 
