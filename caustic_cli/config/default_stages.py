@@ -240,5 +240,10 @@ def wave_refinement(samples: float, wavelengths: int, effort: Effort = STANDARD,
     """
     seconds = sum(n * samples * (SECONDS_A_SAMPLE * (wavelengths or count) + SECONDS_A_POINT) for count, n in effort.waves)
     part = min(1.0, effort.wave_seconds / seconds) if timed else 1.0
-    stages = [(count, int(part * n)) for count, n in effort.waves]
-    return [s for s in stages if s[1] >= LEAST_WAVES]
+    stages, left = [], 0  # over from stages that are too short
+    for count, n in effort.waves:
+        left += int(part * n)
+        if left >= LEAST_WAVES:
+            stages.append((count, left))
+            left = 0
+    return stages

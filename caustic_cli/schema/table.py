@@ -467,7 +467,7 @@ class DesignSettings(Section):
             " and for a network trained over a range", option=Option("--preconditioner", "none|laplacian"))
     filter_target: bool = setting("filter the target like the render", default=True, why="otherwise the blur of the filter counts"
             " as an error")
-    waves: str = setting("refine the wave image after the ray image: auto (where diffraction matters and time allows), on or off",
+    waves: str = setting("refine the wave image: auto (where diffraction matters and time allows), on or off",
             choices=("auto", "on", "off"), default="auto", why="effects are simulated where a scene needs them",
             option=Option("--waves", "auto|on|off"))
     robust: str = setting("file of manufacturing and alignment errors, such as examples/tolerances.toml, over which the loss of the"
