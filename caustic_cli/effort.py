@@ -126,7 +126,7 @@ DRAFT = Effort(
     refinement=Refinement(1.0, 256, 16, 1_000_000, 2, ((1.0, 14),), large=LargePictures(256)),
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
     system=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
-    waves=((3, 10),),
+    waves=((3, 6), (5, 6)),
     wave_seconds=8.0,
 )
 STANDARD = Effort(
@@ -138,7 +138,7 @@ STANDARD = Effort(
     ),
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 48, 3_000_000, 4, ((1.0, 50),)),
-    waves=((4, 10), (5, 10), (6, 20)),
+    waves=((5, 20), (6, 20)),
     wave_seconds=25.0,
 )
 FINE = Effort(
@@ -147,7 +147,7 @@ FINE = Effort(
     refinement=Refinement(2.0, 957, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25)), large=LargePictures(700)),
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 64, 4_000_000, 4, ((1.0, 200),)),
-    waves=((4, 12), (6, 16), (8, 40)),
+    waves=((5, 12), (6, 12), (8, 40)),
     wave_seconds=90.0,
 )
 TEST = replace(

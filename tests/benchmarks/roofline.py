@@ -10,6 +10,7 @@ a division or root counted as one.  Medians over rounds in which all stages take
 
 from __future__ import annotations
 
+import argparse
 import math
 import statistics
 import time
@@ -86,9 +87,7 @@ def wave_stages() -> dict[str, Stage]:
         moved.of(heights)
 
     return {
-        "change of the paths": Stage(
-            "sample", points, 20 + 4 + 256 * pieces / points, 40 + 128 * pieces / points, change_of
-        ),
+        "change of the paths": Stage("sample", points, 20 + 4 + 256 * pieces / points, 40 + 128 * pieces / points, change_of),
         "field": Stage("sample", points, 12 + 16, 34, lambda: fields.make_field(-1, *light._field(change), buffer, blocks)),
         "transform": Stage("sample", samples, 2 * 24, transform, lambda: torch.fft.fft2(spectrum, norm="ortho")),
         "power on pixels": Stage("sample", samples, 8, 6, lambda: fields.on_pixels(-1, pairs, *light.limits, out, blocks)),
@@ -119,6 +118,7 @@ def ray_stages() -> dict[str, Stage]:
 
 def main() -> None:
     """Print the table."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     bandwidth, arithmetic = machine()
     stages = wave_stages() | ray_stages()
     times = interleaved({name: stage.run for name, stage in stages.items()}, ROUNDS)
