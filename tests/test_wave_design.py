@@ -100,6 +100,30 @@ def test_gradient_of_the_loss(source, how):
     assert torch.allclose(again.gradient, found.gradient, rtol=1e-9, atol=1e-12 * float(found.gradient.abs().max()))
 
 
+@pytest.mark.parametrize("source", [None, Points(((0.1, 0.0, -80.0),)), Disc(angle=0.1)], ids=["plane", "point", "disc"])
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.0, 4.0)])
+def test_the_kernels_are_as_accurate_as_single_precision_allows(source, tilt):
+    """In float32 the loss and its derivative are computed by kernels, in float64 by plain torch."""
+    scene = scene_of(source)
+    scene = replace(scene, screen=replace(scene.screen, tilt=tilt))
+    heights, field = heights_of(scene), HeightField.of(scene.lens)
+    noise = torch.randn(heights.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    single, exact = (
+        WaveObjective(scene, field, heights, goal(), "rms-light", wavelengths=(500.0, 600.0), dtype=dtype)(heights + 2e-5 * noise)
+        for dtype in (torch.float32, torch.float64)
+    )
+    assert single.loss == pytest.approx(exact.loss, rel=1e-4)
+    assert float((single.gradient - exact.gradient).abs().max()) < 1e-3 * float(exact.gradient.abs().max())
+
+
+def test_an_image_that_is_computed_whole_is_that_by_blocks(monkeypatch):
+    scene = scene_of()
+    heights, field = heights_of(scene), HeightField.of(scene.lens)
+    whole = wave_image(scene, field, heights).image
+    monkeypatch.setattr("caustic_cli.optics.waves.image.WHOLE", 0)
+    assert float((wave_image(scene, field, heights).image - whole).abs().max()) < 2e-5 * float(whole.max())
+
+
 def test_the_path_around_a_lens_is_that_of_the_moved_lens():
     """The loss' own image after a move of 0.1 micrometres against that of an exact trace of the moved lens."""
     scene = scene_of()

@@ -46,8 +46,8 @@ from caustic_cli.scene.materials import nearest_index
 NM = 1e-6
 #: Transform samples per second on two cores; largest number of samples of a wave image that was not requested explicitly.
 A_SECOND, UNASKED = 1e8, 120e8
-#: Bytes per sample of an image that is computed whole, in numbers of the field.
-WHOLE = 3
+#: Most samples of a transform that is computed whole, with about 50 bytes each; others are by blocks.
+WHOLE = 1 << 24
 #: Traced nodes per knot span of the finest surface, and their least number along an axis.
 A_SPAN, LEAST_NODES = 3, 384
 #: Largest margin of the computed region on each side of the screen, relative to the screen's width.
@@ -443,7 +443,7 @@ class Imager:
         if torch.is_grad_enabled() and front.path.requires_grad:
             self._check_memory(wide)
             found = power_on_pixels(*self.field(line, front, dtype), s.padded, *self._masks(line, front, dtype)).double()
-        elif s.pieces(WHOLE * wide) == 1:
+        elif s.samples <= WHOLE:
             exposure = self.exposure(line, front, dtype)
             assert isinstance(exposure, Exposure)
             found = exposure.image(torch.zeros_like(exposure.phase)).double()
