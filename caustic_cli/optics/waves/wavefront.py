@@ -122,14 +122,17 @@ class Optics:
 
     def intercepts(self, u: Tensor, v: Tensor, sensitive: bool = False) -> Intercepts:
         """Intercepts of the rays through points (N,) of the pupil; sensitive: with those at the last surface."""
-        parts = []
-        step = max(1, len(u)) if torch.is_grad_enabled() else CHUNK
-        for start in range(0, max(1, len(u)), step):
-            met = self.interactions(u[start : start + step], v[start : start + step])
-            parts.append(_with_last(met, self.intercepts_of(met)) if sensitive else self.intercepts_of(met))
-        if len(parts) == 1:
-            return parts[0]
-        return Intercepts(*(torch.cat(c) for c in zip(*(p.columns() for p in parts), strict=True)))
+        if torch.is_grad_enabled() or len(u) <= CHUNK:
+            met = self.interactions(u, v)
+            return _with_last(met, self.intercepts_of(met)) if sensitive else self.intercepts_of(met)
+        found: Intercepts | None = None
+        for start in range(0, len(u), CHUNK):
+            part = slice(start, start + CHUNK)
+            new = self.intercepts(u[part], v[part], sensitive)
+            found = found or Intercepts(*(c.new_empty(len(u)) for c in new.columns()))
+            found.updated(part, new)
+        assert found is not None
+        return found
 
     def landing(self, mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Landing points X, Y of another mode's light, mm, its power, and its points on the last element, mm."""
