@@ -162,17 +162,15 @@ class Designer:
             CausticError: no light reaches the screen at the beginning of a stage, or the loss there is not finite.
         """
         started, earlier = time.monotonic(), state.seconds
-        begun = {row[1] for row in state.history} | set(range(state.stage, len(self.stages)))
-        left_out = {k for k, s in enumerate(self.stages) if s.spare and k not in begun}
-        last = len(self.stages) - 1
-        costs = [s.cost for s in self.stages]
-        ahead = sum(costs[state.stage :])
+        done_in = {row[1] for row in state.history}
+        used = {k: s for k, s in enumerate(self.stages) if k >= state.stage or k in done_in or not s.spare}
+        first, last = state.stage, len(self.stages) - 1
         state.reason = ""
-        for k in range(state.stage, last + 1):
-            deadline = started + time_limit
+        for k in range(first, last + 1):
+            deadline, ahead = started + time_limit, sum(s.cost for j, s in used.items() if j >= first)
             if k < last and ahead and math.isfinite(time_limit):
-                deadline = started + time_limit * sum(costs[state.stage : k + 1]) / ahead
-            limit = iterations or sum(s.iterations for j, s in enumerate(self.stages) if j not in left_out)
+                deadline = started + time_limit * sum(s.cost for j, s in used.items() if first <= j <= k) / ahead
+            limit = iterations or sum(s.iterations for s in used.values())
             end = partial(self._end, state, k, limit, deadline, stop)
             try:
                 done = self._stage(state, k, end, on_iteration, notice, started - earlier)
@@ -180,7 +178,7 @@ class Designer:
                 notice(f"stage {k + 1}: {skipped}")
                 state.reason, done = skipped.reason, True
                 if self.stages[k].spare:
-                    left_out.add(k)
+                    del used[k]
             if not done or k == last:
                 break
             state = self._next(state, k + 1)
