@@ -28,12 +28,12 @@ from caustic_cli.inverse.loss_terms import PENALTIES, parse
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.inverse.schedule import LossImage
-from caustic_cli.optics.emission import Rays
+from caustic_cli.optics.emission import Emission, Rays
 from caustic_cli.optics.memory import smaller_chunk
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
-from caustic_cli.optics.trace import Parameters, Tracer, tracers
+from caustic_cli.optics.trace import Parameters, Tracer, is_by_rows, tracers
 from caustic_cli.scene import Scene, Screen
 
 if TYPE_CHECKING:
@@ -219,11 +219,10 @@ class Objective:
         return self.kept is not None and (sum(t.fused is None for _, t in self.kept) <= self.graphs)
 
     def _rows(self) -> bool:
-        """Whether the rays are a tensor grid of an axial plane wave, for which there is a fused kernel."""
-        if not (self.scene.screen.upright and all(isinstance(s, Sampler) and s.tensor for s in self.samplers)):
+        """Whether the rays are a tensor grid on the exit, for which there is a fused kernel."""
+        if not (self.scene.screen.upright and all(isinstance(s, (Sampler, Emission)) and s.tensor for s in self.samplers)):
             return False
-        _, first = next(self._tracers(), (0, None))
-        return first is not None and first.fused is not None and first.start.along_axis
+        return all(is_by_rows(self.scene, self.field, s) for s in self.samplers)
 
     def _tracers(self) -> Iterator[tuple[int, Tracer]]:
         """Tracers of the chunks of this rank, each with the index of its source point."""

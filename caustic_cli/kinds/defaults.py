@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +13,8 @@ from caustic_cli.config.design import relative_to_initial
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen
 from caustic_cli.effort import DRAFT, EFFORTS, FINE, STANDARD, Effort, current_effort
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.source_limits import source_spread
+from caustic_cli.inverse.source_limits import point_source, source_spread
+from caustic_cli.optics.trace import evaluates_by_rows
 from caustic_cli.scene import Scene, Source
 from caustic_cli.schema.table import DesignSettings, LensSettings, StageSettings, check
 
@@ -118,9 +120,20 @@ class Defaults:
     @cached_property
     def shifts(self) -> bool:
         """Whether the source's extent only shifts the image."""
+        return source_spread(self._scene) is not None
+
+    def scattered(self, spread: bool) -> bool:
+        """Whether every ray has to be intersected with the surface; spread: those of the source's centre are traced."""
+        scene = self._scene
+        scene = replace(scene, source=point_source(scene)) if spread else scene
+        return not (scene.source.collimated or evaluates_by_rows(scene))
+
+    @property
+    def _scene(self) -> Scene:
+        """The scene with some control net."""
         s = self.s
         lens = build_lens(s.lens.filled(control=[LEAST_SPANS] * 2))
-        return source_spread(Scene(self.source, lens, build_screen(s.screen), build_light(s))) is not None
+        return Scene(self.source, lens, build_screen(s.screen), build_light(s))
 
     def complete_given_stages(self) -> bool:
         """Complete stages of the user's own; False if there are none."""

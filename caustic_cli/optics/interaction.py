@@ -22,13 +22,16 @@ class RayTracer(Protocol):
     """The interface of `trace.Tracer` that effects use.
 
     system: the system traced; media: in front of each element and behind the last; sides: from which the axis reaches each
-    element; start: the rays at the first free surface.
+    element.
     """
 
     system: System
     media: tuple[Medium, ...]
     sides: tuple[float, ...]
-    start: RayState
+
+    @property
+    def start(self) -> RayState:
+        """The rays at the first free surface."""
 
     @property
     def backend(self) -> Any:

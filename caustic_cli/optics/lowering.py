@@ -10,8 +10,9 @@ from typing import TypeGuard
 
 from caustic_cli.optics.backends import Fused
 from caustic_cli.optics.frames import Pose
+from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.rays import RayState
-from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.surfaces import HeightField, Plane
 from caustic_cli.optics.system import Element, PlacedScreen
 from caustic_cli.scene import Pupil, Screen
 
@@ -19,6 +20,8 @@ from caustic_cli.scene import Pupil, Screen
 def lowered(tracer, previous: Fused | None) -> Fused | None:
     """The rest of a tracer's system as one fused kernel; None where it does not apply.  previous: that of the previous chunk, whose
     prepared arrays are reused."""
+    if isinstance(tracer.rays, Pencil) and (fused := _pencil(tracer, tracer.rays, previous)) is not None:
+        return fused
     system, start, (inside, outside) = tracer.system, tracer.start, tracer.media[-2:]
     element = system.elements[-1]
     if _needs_stages(tracer) or tracer.first != len(system.elements) - 1 or not _is_plain(element, system.pupil):
@@ -33,6 +36,23 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
     if element.aperture != system.pupil.aperture:
         return None
     return tracer.backend.plane_image(element.surface, start, eta, element.fresnel, previous)
+
+
+def _pencil(tracer, pencil: Pencil, previous: Fused | None) -> Fused | None:
+    """All of a tracer's system as one kernel for the rays of a source point: a flat entrance in front of the last surface."""
+    system = tracer.system
+    if _needs_stages(tracer) or len(system.elements) != 2 or not system.lit:
+        return None
+    (entrance, exit), pupil = system.elements, system.pupil
+    upright = isinstance(entrance.surface, Plane) and entrance.pose == Pose((0.0, 0.0, pupil.z)) and not entrance.reflects
+    if not (upright and _is_plain(exit, pupil) and exit.aperture == entrance.aperture == pupil.aperture):
+        return None
+    before, inside, outside = (medium.index_at(tracer.wavelength) for medium in tracer.media)
+    if inside <= before or (exit.fresnel == "schlick" and inside < outside):
+        return None
+    return tracer.backend.pencil_image(
+        exit.surface, pencil, (inside / before, entrance.fresnel), inside / outside, exit.fresnel, previous
+    )
 
 
 def _needs_stages(tracer) -> bool:

@@ -21,9 +21,9 @@ from caustic_cli.scene import Aperture
 def meet(tracer, m, heights: Tensor | None) -> None:
     """Transfer the rays of an `Interaction` to its surface, of these heights."""
     element, system = m.element, tracer.system
-    prepared = tracer.prepared_intersection if m.state is getattr(tracer, "start", None) else None  # valid for these rays only
+    prepared = tracer.prepared_intersection if m.state is tracer.begun else None  # valid for these rays only
     state = replace(m.state, lost=dict(m.state.lost))
-    if m.index == tracer.first and m.forward and heights is not None:
+    if heights is not None and m.forward and m.index == tracer.first:
         state = state.counted_from(element.pose.position[2] + element.surface.centred(heights)[1])
     if _at_pupil(system, m):
         state = tracer.media[m.beyond].entering(state)

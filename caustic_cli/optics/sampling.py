@@ -137,6 +137,16 @@ class Sample:
     flux: Tensor
 
     @property
+    def device(self) -> torch.device:
+        """Where its points are."""
+        return self.u.device
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        return math.prod(self.shape)
+
+    @property
     def shape(self) -> tuple[int, ...]:
         """Shape of everything traced from this sample: (len(u), len(v)) or (len(u),)."""
         return (len(self.u), len(self.v)) if self.tensor else (len(self.u),)

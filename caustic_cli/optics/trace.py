@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import cast
@@ -32,13 +32,14 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import Fused, backend_for, in_forward_mode, usable
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
-from caustic_cli.optics.emission import Rays, of_member, rays_of
+from caustic_cli.optics.emission import Emission, Rays, of_member, rays_of
 from caustic_cli.optics.frames import rotate_to_global, rotate_to_local
 from caustic_cli.optics.image import Image, with_colour
 from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.interface import OutgoingRays, interact
 from caustic_cli.optics.lowering import covers, lowered
 from caustic_cli.optics.memory import with_smaller_chunks
+from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.ray_transfer import prepared_intersection
 from caustic_cli.optics.rays import LOSSES, RayState, RayStatus
 from caustic_cli.optics.receiver import Receiver
@@ -51,8 +52,24 @@ from caustic_cli.scene import Scene, Screen
 
 #: Rays per chunk, which bounds the memory.
 CHUNK = 1 << 19
+#: Rays by which the treatment of all is decided.
+FEW = 1 << 12
 #: No parameters at all.
 NOTHING: Parameters = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Front:
+    """Rays in front of the first free-form surface, and how they got there."""
+
+    #: The rays, and the index of the first element that they have not met.
+    start: RayState
+    first: int
+    #: All interactions, if they are recorded, and the last.
+    interactions: list[Interaction]
+    behind: Interaction | None
+    #: Power through the pupil, ().
+    entering: Tensor
 
 
 class Tracer:
@@ -60,7 +77,8 @@ class Tracer:
 
     Args:
         system: the system.
-        rays: on the pupil, in front of the first element: sampled points of a plane wave, or a ray state.
+        rays: on the pupil, in front of the first element: sampled points of a plane wave, or a ray state; or a pencil, which is
+            traced from there unless it can be lowered.
         dtype: precision of the ray arithmetic, where the backend has a choice.  Intersections are always computed in float64.
         requests: of a plan, on effects that the system does not express.
         like: the tracer of the previous chunk through the same system, whose prepared arrays are reused where they are equal.
@@ -72,7 +90,7 @@ class Tracer:
     def __init__(
         self,
         system: System,
-        rays: Sample | RayState,
+        rays: Sample | RayState | Pencil,
         dtype: torch.dtype = torch.float64,
         requests: Requests = NO_REQUESTS,
         like: Tracer | None = None,
@@ -89,40 +107,68 @@ class Tracer:
         self.media, self.sides = system.media(), system.sides()
         #: Of gradient-index media: numbers of integration steps by (medium, element, forward), with the parameters they are for.
         self.steps: dict[tuple[int, int, bool], tuple[int, list]] = {} if like is None else dict(like.steps)
-        pupil = system.pupil
-        state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
-        state = replace(state, lost=dict(state.lost), wavelength=wavelength)
-        self._backend = backend_for(state.power.device)
+        self.rays, self.wavelength = rays, wavelength
+        self._backend = backend_for(rays.power.device if isinstance(rays, RayState) else rays.device)
         self._prepared: dict[str, Callable[[Tensor], SurfaceIntersection] | None] = {}
         self.dtype = self._backend.precision(dtype)
-        acting = EFFECTS.acting(system, requests)
-        for effect in acting:
-            state = effect.prepare(system, state, requests)
-        made = (effect.action(system, requests) for effect in acting)
-        #: Power through the pupil, () or, with colours, (3,).
-        shape = state.power.shape if state.sample is None else state.sample.shape
-        self.entering = self._of_color(weight * state.power.expand(shape).sum(dtype=torch.float64))
+        self._acting = EFFECTS.acting(system, requests)
+        made = (effect.action(system, requests) for effect in self._acting)
         self.actions: tuple[Action, ...] = tuple(a for a in made if a is not None)
         self.recorded = any(a.stray for a in self.actions)
-        self.interactions_in_front: list[Interaction] = []
-        self.first = 0
-        self._behind: Interaction | None = None
+        self.fused: Fused | None = lowered(self, None if like is None else like.fused)
+        #: Power through the pupil, (), where a fused pencil knows it without a trace of the rays in front of the lens.
+        self.lit: Tensor | None = getattr(self.fused, "entering", None)
+        #: Power through the pupil, () or, with colours, (3,).
+        self.entering = self._of_color(weight * (self._front.entering if self.lit is None else self.lit))
+
+    @cached_property
+    def _front(self) -> Front:
+        """The trace up to the first free-form surface, made when it is first asked for."""
+        rays, pupil, system = self.rays, self.system.pupil, self.system
+        state = rays.at_pupil() if isinstance(rays, Pencil) else rays
+        state = state if isinstance(state, RayState) else RayState.on_axis(state, pupil.half_size, pupil.z)
+        state = replace(state, lost=dict(state.lost), wavelength=self.wavelength)
+        for effect in self._acting:
+            state = effect.prepare(system, state, self.requests)
+        shape = state.power.shape if state.sample is None else state.sample.shape
+        entering = state.power.expand(shape).sum(dtype=torch.float64)
+        interactions, first, behind = [], 0, None
         with torch.no_grad():
             while (
-                self.first < len(system.elements)
-                and system.elements[self.first].surface.shape is None
-                and not any(medium.varies for medium in self.media[self.first : self.first + 2])
+                first < len(system.elements)
+                and system.elements[first].surface.shape is None
+                and not any(medium.varies for medium in self.media[first : first + 2])
             ):
-                interaction = self.trace_element(self.first, state, None)
+                behind = self.trace_element(first, state, None)
                 if self.recorded:
-                    self.interactions_in_front.append(interaction)
-                state, self.first, self._behind = interaction.state, self.first + 1, interaction
-        self.start = state
-        self.fused: Fused | None = lowered(self, None if like is None else like.fused)
+                    interactions.append(behind)
+                state, first = behind.state, first + 1
+        return Front(state, first, interactions, behind, entering)
+
+    @property
+    def start(self) -> RayState:
+        """The rays in front of the first free-form surface."""
+        return self._front.start
+
+    @property
+    def begun(self) -> RayState | None:
+        """`start`, or None while it is being made."""
+        front = self.__dict__.get("_front")
+        return None if front is None else front.start
+
+    @property
+    def first(self) -> int:
+        """Index of the first element that `start` has not met."""
+        return self._front.first
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        return self.rays.count
 
     def __call__(self, parameters: Parameters) -> list[RayState]:
         """Heights {name: (n, m) mm float64} -> rays behind the last element: the direct light, then stray light."""
-        state, interactions = self.start, list(self.interactions_in_front)
+        state, interactions = self.start, list(self._front.interactions)
         for interaction in self._interactions(parameters):
             state = interaction.state
             if self.recorded:
@@ -166,7 +212,7 @@ class Tracer:
 
     def last(self, parameters: Parameters) -> Interaction:
         """The direct light at the last element."""
-        return cast(Interaction, [self._behind, *self._interactions(parameters)][-1])  # a system has at least one element
+        return cast(Interaction, [self._front.behind, *self._interactions(parameters)][-1])  # a system has at least one element
 
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
@@ -193,8 +239,9 @@ class Tracer:
         """Heights {name: (n, m) mm float64} -> image and energy balance on a screen."""
         if self.fused is not None and covers(screen) and not in_forward_mode():
             image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
-            for name, value in self.start.lost.items():
-                lost[name] = lost.get(name, 0.0) + value
+            if self.lit is None:
+                for name, value in self.start.lost.items():
+                    lost[name] = lost.get(name, 0.0) + value
             return self._weighed(image, leaving, lost)
         return self.collect(self(parameters), screen, filter)
 
@@ -218,7 +265,7 @@ class Tracer:
         w = self.weight
         if w != 1.0:
             image, leaving, lost = w * image, w * leaving, {name: w * value for name, value in lost.items()}
-        return Image(self._of_color(image), self._of_color(leaving), lost, self.start.count)
+        return Image(self._of_color(image), self._of_color(leaving), lost, self.count)
 
     def _of_color(self, value: Tensor) -> Tensor:
         """`value` in this light's colour channel of three; unchanged without colours."""
@@ -309,6 +356,20 @@ def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUEST
     return covers(scene.screen) and Tracer(System.of(scene, field), few, requests=requests).fused is not None
 
 
+def is_by_rows(scene: Scene, field: HeightField, rays: Rays) -> bool:
+    """Whether rays are traced by a fused kernel that evaluates the surface at a tensor product of its points."""
+    first = next(tracers(scene, field, rays, torch.float64, FEW), None)
+    return first is not None and first.fused is not None and (first.lit is not None or first.start.along_axis)
+
+
+def evaluates_by_rows(scene: Scene) -> bool:
+    """Whether a regular grid of rays of a scene's source is traced in this way, whatever the surface."""
+    p, q = scene.lens.degree
+    lens = replace(scene.lens, control=(p + 1, q + 1), knots=None, array=(1, 1))
+    scene = replace(scene, lens=lens)
+    return is_by_rows(scene, HeightField.of(lens), rays_of(scene, "grid", 4))
+
+
 def trace(system: System, rays: Sample | RayState, parameters: Parameters, **options) -> list[RayState]:
     """Rays behind the last element of a system: the direct light, then stray light.  options: of a `Tracer`."""
     return Tracer(system, rays, **options)(parameters)
@@ -331,10 +392,17 @@ def tracers(
     bands = scene.bands
     for band in bands:
         system, traced = System.of(band.scene, field), None
-        for rays in of_member(sampler, band.member).chunks(chunk, *share):
+        for rays in _chunks(of_member(sampler, band.member), chunk, share):
             traced = Tracer(system, rays, dtype, requests, traced, weight=band.weight, channel=band.channel, **options)
             traced.colour = band.colour
             yield traced
+
+
+def _chunks(sampler: Rays, size: int, share: tuple[int, int]) -> Iterator[Sample | RayState | Pencil]:
+    """The rays of a sampler, as pencils where they are."""
+    if isinstance(sampler, Emission) and sampler.homocentric:
+        return sampler.pencils(size, *share)
+    return sampler.chunks(size, *share)
 
 
 def expose(

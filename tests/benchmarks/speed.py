@@ -19,18 +19,21 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.schedule import LossImage
+from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene.sources.points import Points
 
 SCREEN = Screen((38.4, 38.4), 300.0, (250, 250))
 ALPHA = 0.01 * SCREEN.pixel[0] ** 2  # 1 / cm^2 = 0.01 / mm^2, per pixel
@@ -128,6 +131,22 @@ def scaling(name: str, values) -> list[dict]:
         for v, t in zip(values, times.values(), strict=True)
     ]
     print(name, rows, flush=True)
+    return rows
+
+
+def sources() -> list[dict]:
+    """The regular grid of a plane wave, the pencil of a point source, and random rays of the latter, intersected one by one."""
+    s, field, heights = scene(BASE["control"], 3, BASE["pixels"])
+    near = replace(s, source=Points(((0.0, 0.0, -500.0),), (1.0,)))
+    how, target = LossImage(Filter("cosine", (3, 3))), torch.ones(SCREEN.resolution, dtype=torch.float64)
+    cases = {"plane wave": (s, "grid"), "point": (near, "grid"), "point, scattered": (near, "stratified")}
+    made = {
+        name: Objective(lit, field, rays_of(lit, kind, BASE["rays"]), target, "rms-light", how)
+        for name, (lit, kind) in cases.items()
+    }
+    times = interleaved({name: partial(one, heights) for name, one in made.items()})
+    rows = [{"source": name, "ms": statistics.median(t) * 1e3} for name, t in times.items()]
+    print(rows, flush=True)
     return rows
 
 
@@ -238,6 +257,7 @@ def main() -> None:
         "degree": scaling("degree", (3, 5, 8, 12)),
         "pixels": scaling("pixels", (100, 250, 500, 1000)),
         "filter": scaling("filter", (1, 3, 5, 7, 11, 15)),
+        "sources": sources(),
         "threads": threads(),
         "memory": memory(),
     }

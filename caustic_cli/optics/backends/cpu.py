@@ -20,12 +20,14 @@ from caustic_cli.optics.interface import OutgoingRays
 from caustic_cli.optics.kernels import fused, fused_functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
+from caustic_cli.optics.kernels.pencil import PencilKernel
 from caustic_cli.optics.kernels.polynomial_index import formula_flow
 from caustic_cli.optics.kernels.ray_intersections import hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.kernels.spline_index import VolumeAxis, volume_flow
 from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, next_intersections, scattered_surface
 from caustic_cli.optics.kernels.transfer import land
+from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import HALVINGS, MOST_STEPS
@@ -184,6 +186,13 @@ class Numba(Torch):
         """The fused kernel for rays of a plane wave on a B-spline: a function of heights, screen and filter."""
         return PlaneImage(field, rays, eta, fresnel, like)
 
+    def pencil_image(
+        self, field, pencil: Pencil, entrance: tuple[float, str], eta: float, fresnel: str, like: PencilImage | None
+    ) -> PencilImage | None:
+        """The fused kernel for the rays of a source point behind a flat entrance, of this index and with these Fresnel losses."""
+        emission = pencil.polynomial(*entrance)
+        return None if emission is None else PencilImage(field, pencil, entrance, emission, (eta, fresnel), like)
+
     def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
         """The fused kernel for arbitrary rays below a B-spline."""
         return RayImage(field, rays, eta, fresnel, radius, like)
@@ -214,6 +223,44 @@ class PlaneImage:
         """Image, power that leaves the surface, and what was lost there."""
         reference = float(heights.detach().mean())
         return self.kernel(heights - reference, *self.interface, screen.z - reference, screen, filter)
+
+
+class PencilImage:
+    """See `Numba.pencil_image`; like: as for `PlaneImage`."""
+
+    def __init__(
+        self, field, pencil: Pencil, entrance: tuple[float, str], emission, interface: tuple[float, str], like: PencilImage | None
+    ):
+        self.interface, s, self.emitted = interface, pencil.sample, pencil.emitted
+        #: Power through the pupil, and less what the entrance reflects, ().
+        self.entering, self.passed = pencil.entering(*entrance)
+        self.kernel: PencilKernel = PencilKernel(
+            field.spaces,
+            field.half_size,
+            s.u,
+            s.v,
+            s.flux,
+            pencil.position[:2],
+            pencil.distance,
+            pencil.z_in,
+            entrance[0],
+            emission,
+            like.kernel if isinstance(like, PencilImage) else None,
+        )
+
+    def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
+        """Image, power that leaves the surface, and what was lost since the source; what misses the surface is the rest."""
+        reference = float(heights.detach().mean())
+        image, leaving, ledger = self.kernel(heights - reference, *self.interface, reference, screen, filter)
+        met = ledger[[fused.LEAVING, fused.FRESNEL, fused.REFLECTED]].sum()
+        lost = {
+            "missed_lens": self.emitted - self.entering,
+            "missed_surface": self.passed - met,
+            "fresnel": self.entering - self.passed + ledger[fused.FRESNEL],
+            "total_internal_reflection": ledger[fused.REFLECTED],
+            "off_screen": ledger[fused.OFF_SCREEN],
+        }
+        return image, leaving, lost
 
 
 class RayImage:

@@ -132,6 +132,10 @@ class Torch:
         """No fused kernel for rays of a plane wave on a B-spline."""
         return None
 
+    def pencil_image(self, *_: Any, **__: Any) -> Fused | None:
+        """No fused kernel for rays of a source point."""
+        return None
+
     def ray_image(self, *_: Any, **__: Any) -> Fused | None:
         """No fused kernel for other rays."""
         return None

@@ -60,7 +60,7 @@ class Microfacets(Action):
             return
         if m.index not in self.noise:
             last = len(m.tracer.system.elements) - 1
-            rays = getattr(m.tracer, "start", m.state)  # `start` is not set in front of the first free surface
+            rays = m.tracer.begun or m.state
             numbers = normal_numbers(FACETS + last - m.index, index_of(rays))
             self.noise[m.index] = tuple(m.element.roughness * n.to(m.state.power.dtype) for n in numbers)
         m.hit.slopes = tuple(g + n for g, n in zip(m.hit.slopes, self.noise[m.index], strict=True))

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.rays import RayState
-from caustic_cli.optics.sampling import SAMPLERS, numbers
+from caustic_cli.optics.sampling import SAMPLERS, TENSOR, numbers
 from caustic_cli.scene import Pupil, Source
 from caustic_cli.scene.sources.distribution import Distribution
 
@@ -76,6 +77,20 @@ class Emission:
         for start in range(first * size, self.count, step * size):
             stop = min(start + size, self.count)
             yield self._drawn(start, *numbers(self.kind, self.shape, self.seed, self.dimensions, start, stop, self.device))
+
+    @property
+    def tensor(self) -> bool:
+        """Whether its samples have tensor-product structure."""
+        return self.kind in TENSOR
+
+    @property
+    def homocentric(self) -> bool:
+        """Whether its rays can be had as `pencils`."""
+        return False
+
+    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Pencil]:
+        """The rays in `chunks` of whole rows, as pencils."""
+        raise NotImplementedError
 
     def _drawn(self, start: int, *draws: Tensor) -> RayState:
         """Rays from number `start` on, from samples of the unit cube: `dimensions` tensors (N,)."""

@@ -16,7 +16,9 @@ The cone itself is sampled if it lies within the aperture, or if the source is N
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import ClassVar
 
 import torch
@@ -24,7 +26,9 @@ from torch import Tensor
 
 from caustic_cli.optics.emission.base import Emission, intensity_of
 from caustic_cli.optics.emission.brightness import points_by_brightness
+from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.sampling import Sampler, numbers
 from caustic_cli.scene.sources.distribution import Distribution
 
 #: A source is near if its projection is at least this many of its distances h inside the aperture's edge: of a hemisphere the
@@ -49,6 +53,44 @@ class Near(Emission):
     def _offsets(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
         """Offset of each ray's start from its position along x and y, mm, from the samples beyond the first two dimensions."""
         raise NotImplementedError
+
+    @property
+    def homocentric(self) -> bool:
+        """Whether its rays can be had as `pencils`: of one point in front of the aperture that illuminates all of it, and that is
+        not so near that the cone is sampled."""
+        source, pupil = self.scene.source, self.scene.pupil
+        if not self.tensor or self.dimensions > 2 or source.several or source.lean or not source.aimed:
+            return False
+        if source.cone is not None and source.incidence(pupil) >= source.cone_over(pupil):
+            return False
+        x, y, z = source.points()[0][0]
+        room = min(r - abs(far) for far, r in pupil.aperture.distances(torch.tensor(x), torch.tensor(y)))
+        return 0.0 <= float(room) < NEAR * (pupil.z - z)
+
+    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Pencil]:
+        source, pupil = self.scene.source, self.scene.pupil
+        (rx, ry), (nu, nv), aperture = pupil.half_size, self.shape, pupil.aperture
+        x, y, z = map(float, source.points()[0][0])
+        cell, start = 4.0 * rx * ry / (nu * nv), first * max(1, size // nv) * nv
+        for sample in Sampler(self.kind, self.shape, self.seed, device=self.device).chunks(size, first, step):
+            if aperture.round:
+                area = cell * aperture.covers(2.0 * sample.u[:, None] - 1.0, 2.0 * sample.v[None, :] - 1.0).double()
+            else:
+                area = torch.tensor(cell, dtype=torch.float64)
+            yield Pencil(
+                replace(sample, flux=area),
+                (rx, ry),
+                (x, y, z),
+                pupil.z,
+                partial(intensity_of, source, source.cone_over(pupil)),
+                sample.count / self.count,
+                partial(self._at_points, start, start + sample.count),
+            )
+            start += step * sample.count
+
+    def _at_points(self, start: int, stop: int) -> RayState:
+        """Rays number start to stop."""
+        return self._drawn(start, *numbers(self.kind, self.shape, self.seed, self.dimensions, start, stop, self.device))
 
     def _drawn(self, start: int, *draws: Tensor) -> RayState:
         u, v, *aside = draws
