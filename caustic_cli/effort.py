@@ -83,10 +83,8 @@ class Effort:
     creased: Refinement
     #: The same for systems without a fused kernel, two free-form sides or a lens among other elements.
     system: Refinement
-    #: Wavelengths of white light in the wave image.
-    wave_colours: int
-    #: Iterations of each stage on the wave image.
-    wave_iterations: tuple[int, ...]
+    #: (wavelengths of white light, iterations) of each stage on the wave image: the first ones need few.
+    waves: tuple[tuple[int, int], ...]
     #: Time for them with `waves = "auto"`, s on two cores.
     wave_seconds: float
 
@@ -128,8 +126,7 @@ DRAFT = Effort(
     refinement=Refinement(1.0, 256, 16, 1_000_000, 2, ((1.0, 14),), large=LargePictures(256)),
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
     system=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
-    wave_colours=3,
-    wave_iterations=(10,),
+    waves=((3, 6), (5, 6)),
     wave_seconds=8.0,
 )
 STANDARD = Effort(
@@ -141,8 +138,7 @@ STANDARD = Effort(
     ),
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 48, 3_000_000, 4, ((1.0, 50),)),
-    wave_colours=5,
-    wave_iterations=(12, 20),
+    waves=((5, 20), (6, 20)),
     wave_seconds=25.0,
 )
 FINE = Effort(
@@ -151,8 +147,7 @@ FINE = Effort(
     refinement=Refinement(2.0, 957, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25)), large=LargePictures(700)),
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 64, 4_000_000, 4, ((1.0, 200),)),
-    wave_colours=8,
-    wave_iterations=(26, 26),
+    waves=((5, 12), (6, 12), (8, 40)),
     wave_seconds=90.0,
 )
 TEST = replace(

@@ -227,8 +227,8 @@ RAYS = {"design": {"waves": "off"}}
 
 def test_the_environment_gives_the_effort_that_no_quality_sets(monkeypatch):
     assert current_effort() == TEST
-    monkeypatch.setenv("CAUSTIC_EFFORT", "fine report=False wave_iterations=(3,)")
-    assert current_effort() == replace(FINE, report=False, wave_iterations=(3,))
+    monkeypatch.setenv("CAUSTIC_EFFORT", "fine report=False waves=((3,9),)")
+    assert current_effort() == replace(FINE, report=False, waves=((3, 9),))
     asked, plain = (complete(OFFSET, 1.0, by).design.stages for by in (Parameters(quality="draft"), None))
     assert [stages[-1].iterations for stages in (asked, plain)] == [25, 120]
     monkeypatch.delenv("CAUSTIC_EFFORT")

@@ -71,6 +71,7 @@ def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
         t.waves or (),
         t.spread,
         t.lenslets,
+        t.spare,
     )
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.lbfgs import UNFIT
+from caustic_cli.inverse.lbfgs import UNFIT, curvature
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import Heights
@@ -161,7 +161,8 @@ class Designer:
             CausticError: no light reaches the screen at the beginning of a stage, or the loss there is not finite.
         """
         started, earlier = time.monotonic(), state.seconds
-        limit = iterations or sum(s.iterations for s in self.stages)
+        begun = {row[1] for row in state.history} | set(range(state.stage, len(self.stages)))
+        left_out = {k for k, s in enumerate(self.stages) if s.spare and k not in begun}
         last = len(self.stages) - 1
         costs = [s.cost for s in self.stages]
         ahead = sum(costs[state.stage :])
@@ -170,12 +171,15 @@ class Designer:
             deadline = started + time_limit
             if k < last and ahead and math.isfinite(time_limit):
                 deadline = started + time_limit * sum(costs[state.stage : k + 1]) / ahead
+            limit = iterations or sum(s.iterations for j, s in enumerate(self.stages) if j not in left_out)
             end = partial(self._end, state, k, limit, deadline, stop)
             try:
                 done = self._stage(state, k, end, on_iteration, notice, started - earlier)
             except Skipped as skipped:
                 notice(f"stage {k + 1}: {skipped}")
                 state.reason, done = skipped.reason, True
+                if self.stages[k].spare:
+                    left_out.add(k)
             if not done or k == last:
                 break
             state = self._next(state, k + 1)
@@ -249,7 +253,9 @@ class Designer:
             return replace(state, stage=k, iteration=0, optimizer={})
         if not self.options.parametrisation.free:
             raise InputError("⟨design.stages.control⟩ cannot change between stages of a network")
-        return replace(state, stage=k, iteration=0, parameters={}, optimizer={}, heights=self._carried(state.heights, k - 1, k))
+        heights = self._carried(state.heights, k - 1, k)
+        kept = curvature(state.optimizer) if self.problem.carries_curvature(k) else {}
+        return replace(state, stage=k, iteration=0, parameters={}, optimizer=kept, heights=heights)
 
     def _carried(self, heights: Tensor, source: int, destination: int) -> Tensor:
         """The same surface on the control net of another stage."""

@@ -130,6 +130,15 @@ class LBFGS:
         return self._accept(*best) if best else False
 
 
+def curvature(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The state of a method that starts at 0 with the curvature found by another one of this `state`; empty from an empty one."""
+    if not state:
+        return {}
+    start = torch.zeros_like(state["x"])
+    pairs = {name: value for name, value in state.items() if name not in ("x", "g", "f")}
+    return {"x": start, "g": start.clone(), "f": torch.empty(0, dtype=torch.float64)} | pairs
+
+
 class _Bracket:
     """Step lengths between which some meet the strong Wolfe conditions, for a value and a slope at 0."""
 

@@ -30,7 +30,7 @@ from caustic_cli.schema.table import check_all
 
 
 class Skipped(CausticError):
-    """A stage that cannot be done, and is left out; reason: of its end."""
+    """A stage that cannot be done, or is not needed, and is left out; reason: of its end."""
 
     def __init__(self, words: str, reason: str):
         super().__init__(words)
@@ -183,6 +183,10 @@ class Problem:
         """Whether stage k goes on with the parameters of the stage before, rather than with its surface."""
         same = self.stages[k].control == self.stages[k - 1].control
         return same and (not self.options.parametrisation.free or self.options.optimizer == "adam")
+
+    def carries_curvature(self, k: int) -> bool:
+        """Whether stage k begins with the curvature that the optimiser of the stage before has found."""
+        return False
 
     def objective(self, k: int, initial: Tensor) -> LossOfHeights:
         """The loss of stage k, for heights near `initial`."""

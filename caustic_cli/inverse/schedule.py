@@ -64,6 +64,8 @@ class Stage:
     spread: bool = default("design.stages.spread")
     #: Each lenslet of an array is compared with its own target, see `lenslets.array_objective`.
     lenslets: bool = default("design.stages.lenslets")
+    #: It is left out if a later stage can refine the wave image.
+    spare: bool = default("design.stages.spare")
 
     def __post_init__(self):
         check_all("design.stages", self, "control", "rays", "iterations", "tolerance", "waves")

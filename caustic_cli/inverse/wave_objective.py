@@ -13,7 +13,9 @@ tracing: the spline at fixed points, one Fourier transform and its adjoint for e
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,33 +25,29 @@ from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.objective import Evaluation, penalty_of
 from caustic_cli.inverse.schedule import LossImage
+from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.image import with_colour
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves.image import Imager, Line, lines_of
-from caustic_cli.optics.waves.propagation import TURN, power_on_pixels
 from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.optics.waves.wavefront import Wavefront
 from caustic_cli.scene import Scene
 
-#: Most bytes of graphs kept for the gradient; beyond, every transform is recomputed.
+#: Most bytes of transforms kept for the gradient; beyond, each is computed twice.
 KEPT = 1 << 30
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """Light of one wavelength and one mode, a point of the source: phase (n, m) rad at h_0 in [0, 2 pi), its derivative with
-    respect to the height (n, m) rad/mm, amplitude (n, m), masks of samples on pixels, and total power."""
+    """Light of one wavelength and one mode, a point of the source: its image as a function of the change of its optical paths since
+    h_0, and its total power."""
 
     line: Line
     mode: int
-    #: Shared by parts with the same rays.
-    front: Wavefront
-    phase: Tensor
-    slope: Tensor
-    amplitude: Tensor
-    rows: Tensor
-    columns: Tensor
+    #: Number of the wavefront, which parts with the same rays share.
+    front: int
+    exposure: Any
     power: float
 
 
@@ -95,25 +93,22 @@ class WaveObjective:
         with torch.no_grad():
             receiver = receiver_of(lines[0].system, screen)
             self.imager = Imager.of(lines, parameters, receiver, watched=_lit(scene, target), dense=True)
+            self.changes: list[Any] = []
             self.parts = list(self._parts(lines[rank::count], parameters))
-        self.fronts = list({id(part.front): part.front for part in self.parts}.values())
         self.in_colour = lines[0].colour is not None
         self.colours = len({line.channel for line in lines if line.channel is not None})
-        n = self.imager.sampling
-        self.keeps_graphs = len(self.parts) * (8 * n.samples + 16 * n.count[0] * n.count[1]) <= KEPT
+        self.keeps = len(self.parts) * 8 * self.imager.sampling.samples <= KEPT
 
-    def _parts(self, lines: list[Line], parameters):
-        imager, made = self.imager, {}
+    def _parts(self, lines: list[Line], parameters) -> Iterator[Contribution]:
+        imager, made, backend = self.imager, dict[tuple, tuple[int, Wavefront]](), backend_for(self.middle.device)
         for line in lines:
             for k, mode in enumerate(imager.modes(line.system)):
                 key = id(line.system), line.label, k
                 if key not in made:  # wavelengths of the same index have the same rays
-                    made[key] = imager.front(line, mode, parameters, sensitive=True)
-                front = made[key]
-                phase, amplitude = imager.field(line, front, self.dtype)
-                slope = (TURN / line.length * front.last.sensitivity).to(self.dtype)
-                rows, columns = imager.masks(line, phase.device, self.dtype)
-                yield Contribution(line, k, front, phase, slope, amplitude, rows, columns, front.power())
+                    made[key] = len(made), imager.front(line, mode, parameters, sensitive=True)
+                    self.changes.append(backend.path_change(self.field, made[key][1].last, self.dtype))
+                number, front = made[key]
+                yield Contribution(line, k, number, imager.exposure(line, front, self.dtype), front.power)
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value and gradient at heights (n, m) mm float64.
@@ -125,21 +120,17 @@ class WaveObjective:
         ranks.broadcast(heights)
         heights.requires_grad_()
         penalty = self.penalty(heights) if self.penalty else torch.zeros((), dtype=torch.float64, device=heights.device)
-        moved = [self._moved(front, heights - self.middle) for front in self.fronts]
+        changes = [change.of(heights.detach() - self.middle) for change in self.changes]
         shape = (3, *self.loss.target.shape) if self.colours else self.loss.target.shape
         image = torch.zeros(shape, dtype=torch.float64, device=heights.device)
         leaving = image.new_zeros(image.shape[:-2])
         xyz = image.new_zeros(3, *image.shape) if self.in_colour else image.new_zeros(0)
-        by = {id(front): z.detach().to(self.dtype).requires_grad_() for front, z in zip(self.fronts, moved, strict=True)}
-        seen = []
-        with torch.set_grad_enabled(self.keeps_graphs):
-            for part in self.parts:
-                found = self._image(part, by[id(part.front)])
-                power = part.line.part * found.detach().double()
-                self._channel(image, part)[...] += power
-                xyz += with_colour(None, power, part.line.colour) if self.in_colour else 0.0
-                self._channel(leaving, part)[...] += part.line.part * part.power
-                seen.append(found if self.keeps_graphs else None)
+        for part in self.parts:
+            found = self.imager.spread_out(part.exposure.image(changes[part.front], self.keeps), part.mode)
+            power = part.line.part * found.double()
+            self._channel(image, part)[...] += power
+            xyz += with_colour(None, power, part.line.colour) if self.in_colour else 0.0
+            self._channel(leaving, part)[...] += part.line.part * part.power
         ranks.all_reduce(image, leaving, xyz)
         image.requires_grad_()
         loss = self.loss(image, leaving, penalty)
@@ -148,13 +139,13 @@ class WaveObjective:
             if penalty.requires_grad
             else (*torch.autograd.grad(loss, (image,)), None)
         )
-        by_moved = {key: torch.zeros_like(z, dtype=torch.float64) for key, z in by.items()}
-        for part, found in zip(self.parts, seen, strict=True):
-            z = by[id(part.front)]
-            found = self._image(part, z) if found is None else found
-            pull = part.line.part * self._channel(by_image, part)
-            by_moved[id(part.front)] += torch.autograd.grad(found, z, pull.to(found.dtype))[0]
-        gradient = torch.autograd.grad(moved, heights, list(by_moved.values()))[0] if moved else torch.zeros_like(heights)
+        by_changes = [torch.zeros_like(change) for change in changes]
+        for part in self.parts:
+            pull = self.imager.gathered(part.line.part * self._channel(by_image, part), part.mode, part.exposure.resolution)
+            part.exposure.pull(pull, changes[part.front], by_changes[part.front])
+        gradient = torch.zeros_like(heights)
+        for change, by in zip(self.changes, by_changes, strict=True):
+            gradient += change.pull(by)
         ranks.all_reduce(gradient)
         if direct is not None:
             gradient = gradient + direct
@@ -163,18 +154,6 @@ class WaveObjective:
             c[..., a : image.shape[-2] - a, a : image.shape[-1] - a] for c in (image.detach(), xyz if len(xyz) else image)
         )
         return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()), shown.detach())
-
-    def _moved(self, front: Wavefront, change: Tensor) -> Tensor:
-        """Displacement of the surface at the intersections of the rays of a wavefront, (n, m) mm."""
-        return front.last.displacement(lambda x, y: self.field.evaluate(change, x, y)[0])
-
-    def _image(self, part: Contribution, moved: Tensor) -> Tensor:
-        imager = self.imager
-        if not imager.receiver.across:
-            front = replace(part.front, path=part.front.path + part.front.last.sensitivity * moved)
-            return imager.image(part.line, front, part.mode, self.dtype)[0]
-        found = power_on_pixels(part.phase + part.slope * moved, part.amplitude, imager.sampling.padded, part.rows, part.columns)
-        return imager.spread_out(found, part.mode)
 
     def _channel(self, values: Tensor, part: Contribution) -> Tensor:
         return values if part.line.channel is None else values[part.line.channel]

@@ -29,10 +29,12 @@ class AmongElements(OneSurface):
         return False
 
     @classmethod
-    def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
-        if cls.exact_start(d):
-            return refinement(d.lens.control, d.rays, d.resolution, d.effort.system)
-        return super().default_stages(d, waves)
+    def creased(cls, d: Defaults, waves: list[Table]) -> bool:
+        return False
+
+    @classmethod
+    def refinement(cls, d: Defaults, creased: bool = False) -> list[Table]:
+        return refinement(d.lens.control, d.rays, d.resolution, d.effort.system)
 
     def _bounds(self, k: int) -> tuple[Tensor, Tensor]:
         low, high = super()._bounds(k)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -81,6 +81,19 @@ class Described(Protocol):
         """The second target on its screen, or None."""
 
 
+class Ahead(NamedTuple):
+    """The objective of stage k in a scene, made before its turn for these initial heights (n, m) mm."""
+
+    scene: Scene
+    k: int
+    initial: Tensor
+    objective: LossOfHeights
+
+    def of(self, scene: Scene, k: int, initial: Tensor) -> bool:
+        """Whether it is that of stage k in a scene for these heights."""
+        return scene is self.scene and k == self.k and torch.equal(initial, self.initial)
+
+
 class OneSurface(Problem):
     """One free-form surface, on rays and on the wave image, under any source."""
 
@@ -90,6 +103,8 @@ class OneSurface(Problem):
     in_stages = True
     #: Whether the thickness and the range of the heights may be adapted to the initial surface.
     adapts = True
+    #: The objective of a stage on the wave image, made in order to leave out stages on rays before it.
+    _ahead: Ahead | None = None
 
     # Settings
 
@@ -196,10 +211,14 @@ class OneSurface(Problem):
 
     @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
-        """The stages on rays unless they are given; waves: those on the wave image that follow."""
+        """The stages on rays unless they are given; waves: those on the wave image that follow.
+
+        Stages on rays after an accurate initial surface do not lower the error of the wave image that is reached after them.
+        """
         lens = d.lens
         if cls.exact_start(d):
-            return cls.refinement(d, cls.creased(d, waves))
+            stages = cls.refinement(d, cls.creased(d, waves))
+            return [stage | {"spare": True} for stage in stages] if waves and d.source.sharp else stages
         if d.plain and "knots_u" not in lens:
             return coarse_to_fine(lens.control, lens.degree, d.sampled, d.resolution, d.effort, sampler=d.sampler)
         return [
@@ -256,16 +275,38 @@ class OneSurface(Problem):
         by_rays = not (self.stages[k].waves or self.stages[k - 1].waves)
         return super().carries_parameters(k) and (by_rays or not self.options.parametrisation.free)
 
+    def carries_curvature(self, k: int) -> bool:
+        before, stage = self.stages[k - 1 : k + 1]
+        return bool(before.waves and stage.waves) and before.control == stage.control
+
     def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
         return QuasiNewton if self.stages[k].waves else super().optimiser(k)
 
     def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         stage = self.stages[k]
         if stage.waves:
+            made, self._ahead = self._ahead, None
+            if made is not None and made.of(scene, k, initial):
+                return made.objective
             return self.on_waves(self.lit(scene, k), k, initial)
+        if stage.spare and self.takes_waves(scene, k, initial):
+            raise Skipped("left out, since the wave image is refined", "waves")
         if stage.spread and (objective := self.on_spread(self.lit(scene, k), k, initial)) is not None:
             return objective
         return super().objective_in(scene, k, initial)
+
+    def takes_waves(self, scene: Scene, k: int, initial: Tensor) -> bool:
+        """Whether a stage after k can refine the wave image of this surface, given on the control net of stage k."""
+        later = next((j for j, stage in enumerate(self.stages) if j > k and stage.waves), None)
+        if later is None or self.stages[later].control != self.stages[k].control:
+            return False
+        if self._ahead is not None and self._ahead.of(scene, later, initial):
+            return True
+        try:
+            self._ahead = Ahead(scene, later, initial.clone(), self.on_waves(self.lit(scene, later), later, initial))
+        except Skipped:
+            return False
+        return True
 
     def on_waves(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         """The objective of stage k on the wave image.

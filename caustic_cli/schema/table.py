@@ -413,6 +413,7 @@ class StageSettings(Section):
             default=False, written=False)
     lenslets: bool = setting("array: compare the image of every lenslet with its own picture, with its share of the rays",
             default=False, written=False)
+    spare: bool = setting("leave this stage out if a later one can refine the wave image", default=False, written=False)
     oversample: int = setting("subdivide pixels for the filter by this factor, and sum them: sharper than the filter on pixels",
             low=1, high=8, default=1)
     blur: float = setting("blur of render and target in the loss", "pixels", 0.0, 1000.0, default=0.0)
@@ -466,7 +467,7 @@ class DesignSettings(Section):
             " and for a network trained over a range", option=Option("--preconditioner", "none|laplacian"))
     filter_target: bool = setting("filter the target like the render", default=True, why="otherwise the blur of the filter counts"
             " as an error")
-    waves: str = setting("refine the wave image after the ray image: auto (where diffraction matters and time allows), on or off",
+    waves: str = setting("refine the wave image: auto (where diffraction matters and time allows), on or off",
             choices=("auto", "on", "off"), default="auto", why="effects are simulated where a scene needs them",
             option=Option("--waves", "auto|on|off"))
     robust: str = setting("file of manufacturing and alignment errors, such as examples/tolerances.toml, over which the loss of the"

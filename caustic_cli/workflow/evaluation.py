@@ -33,6 +33,8 @@ REPORT_SAMPLES = 401
 PROBE, RETRACES, WAVE_IMAGES, RADIUS, REPORT_SECONDS = 16, 2.5, 4, 1.5, 2.5
 #: Time of an iteration relative to that of its image alone.
 BACKWARD = 2.5
+#: Time of the retraces and wave images of an evaluation, in iterations of the last stage on the wave image.
+WAVE_ITERATIONS = 15
 
 
 def evaluate_and_write(project: Project, designer: Designer, state: State, timed: bool = False) -> Evaluated:
@@ -109,8 +111,8 @@ def evaluation_seconds(designer: Designer, state: State) -> float:
     for k, stage in enumerate(designer.stages):
         times = history[history[:, 1] == k, 4]
         if len(times) > 1:
-            images = WAVE_IMAGES if stage.waves else RETRACES * rays / stage.rays
-            seconds[bool(stage.waves)] = images * float(np.median(np.diff(times))) / BACKWARD  # by the last stage of each kind
+            images = WAVE_ITERATIONS if stage.waves else RETRACES * rays / stage.rays / BACKWARD
+            seconds[bool(stage.waves)] = images * float(np.median(np.diff(times)))  # by the last stage of each kind
     return REPORT_SECONDS + sum(seconds.values())
 
 

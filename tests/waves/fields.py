@@ -9,7 +9,7 @@ import torch
 from scipy.interpolate import CubicSpline
 from scipy.special import fresnel
 
-from caustic_cli.optics.waves.propagation import TURN, cells, power_on_pixels, ramp
+from caustic_cli.optics.waves.propagation import TURN, cells, pixel_edges, power_on_pixels, ramp
 from caustic_cli.optics.waves.sampling import Sampling
 
 GAUSS = np.polynomial.legendre.leggauss(8)
@@ -78,7 +78,7 @@ class Given:
         self.x, self.y = (s.low[k] + s.step[k] * (np.arange(s.count[k]) + 0.5) for k in (0, 1))
         first, spacing = s.first(wavelength), s.spacing(wavelength)
         self.masks = [
-            cells(-screen[k], pixel[k], resolution[k], first[k], spacing[k], s.padded[k], torch.device("cpu")) for k in (0, 1)
+            cells(pixel_edges(-screen[k], pixel[k], resolution[k], first[k], spacing[k], s.padded[k]), s.padded[k]) for k in (0, 1)
         ]
         #: Area of a cell over that of a pixel: by it power of unit incident irradiance becomes irradiance.
         self.scale = 1.0 / (pixel[0] * pixel[1])

@@ -11,7 +11,7 @@ import torch
 from fields import Given, disc, mean_around, mean_over, middles, slit
 from scipy.special import airy, j0, j1, jv
 
-from caustic_cli.optics.waves.propagation import cells, power_by_blocks, power_on_pixels
+from caustic_cli.optics.waves.propagation import cells, pixel_edges, power_by_blocks, power_on_pixels
 from caustic_cli.optics.waves.sampling import Sampling
 
 LAMBDA = 5.5e-4
@@ -200,7 +200,7 @@ def test_energy_of_the_transform(dtype, tolerance):
     s = given.sampling
     first, spacing = s.first(LAMBDA), s.spacing(LAMBDA)
     whole = [
-        cells(first[k] - spacing[k], spacing[k] * (n + 1) / 7, 7, first[k], spacing[k], n, torch.device("cpu")).to(dtype)
+        cells(pixel_edges(first[k] - spacing[k], spacing[k] * (n + 1) / 7, 7, first[k], spacing[k], n), n).to(dtype)
         for k, n in enumerate(s.padded)
     ]
     for mask in whole:
@@ -235,13 +235,13 @@ def test_single_precision():
 
 def test_cells_share_out_every_sample():
     """Columns sum to 1 inside, to 0 outside, and a sample across an edge is shared in proportion."""
-    found = cells(-1.0, 0.5, 4, -3.05, 0.1, 61, torch.device("cpu"))
+    found = cells(pixel_edges(-1.0, 0.5, 4, -3.05, 0.1, 61), 61)
     at = -3.05 + 0.1 * np.arange(61)
     whole = found.sum(0).numpy()
     np.testing.assert_allclose(whole, np.clip((1.0 - np.abs(at)) / 0.1 + 0.5, 0.0, 1.0), atol=1e-12)
-    shared = cells(0.0, 1.0, 2, 0.93, 0.2, 1, torch.device("cpu"))
+    shared = cells(pixel_edges(0.0, 1.0, 2, 0.93, 0.2, 1), 1)
     np.testing.assert_allclose(shared[:, 0].numpy(), [0.85, 0.15], atol=1e-12)
-    assert float(cells(5.0, 0.5, 4, -3.05, 0.1, 61, torch.device("cpu")).abs().max()) == 0.0
+    assert float(cells(pixel_edges(5.0, 0.5, 4, -3.05, 0.1, 61), 61).abs().max()) == 0.0
 
 
 def test_samples_follow_lens_and_screen():

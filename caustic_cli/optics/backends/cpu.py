@@ -6,6 +6,7 @@ The reference handles stages without a kernel, and empty sets of rays.
 from __future__ import annotations
 
 from functools import lru_cache
+from importlib import import_module
 
 import numpy as np
 import torch
@@ -139,6 +140,22 @@ class Numba(Torch):
         direction, polarised = _components(direction), None if polarised is None else _components(polarised)
         return OutgoingRays(*interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
 
+    def phase(self, path: Tensor, sampling, length: float, behind: float, dtype: torch.dtype) -> Tensor:
+        """As the reference, which handles float64."""
+        if dtype != torch.float32:
+            return super().phase(path, sampling, length, behind, dtype)
+        return fields().phase(path, sampling, length, behind)
+
+    def exposure(self, phase: Tensor, amplitude: Tensor, factor: float, shape: tuple[int, int], edges: tuple[Tensor, Tensor]):
+        """As the reference, which handles float64."""
+        make = fields().FusedExposure if phase.dtype == torch.float32 else super().exposure
+        return make(phase, amplitude, factor, shape, edges)
+
+    def path_change(self, surface, last, dtype: torch.dtype):
+        """As the reference, which handles float64."""
+        make = fields().FusedPathChange if dtype == torch.float32 else super().path_change
+        return make(surface, last, dtype)
+
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """As the reference."""
         return land(origin, direction, point, axes, forward)
@@ -154,6 +171,11 @@ class Numba(Torch):
     def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
         """The fused kernel for arbitrary rays below a B-spline."""
         return RayImage(field, rays, eta, fresnel, radius, like)
+
+
+def fields():
+    """The kernels of wave images, which not every design needs."""
+    return import_module("caustic_cli.optics.kernels.fields")
 
 
 def _components(vector) -> tuple:

@@ -52,20 +52,20 @@ def coefficients(i, heights, first_u, mu, first_v, mv, out):
         on_threads(len(mu), (heights, first_u, mu, first_v, mv, out))
         return
     p, q = mu.shape[1], mv.shape[1]
-    part = np.empty((p, q))
-    for j in range(len(mv)):
-        for a in range(p):
-            for b in range(q):
-                total = 0.0
-                for k in range(p):
-                    total += mu[i, a, k] * heights[first_u[i] + k, first_v[j] + b]
-                part[a, b] = total
-        for a in range(p):
+    part = np.zeros(heights.shape[1])
+    for a in range(p):
+        part[:] = 0.0
+        for k in range(p):
+            weight, row = mu[i, a, k], heights[first_u[i] + k]
+            for j in range(len(part)):
+                part[j] += weight * row[j]
+        for j in range(len(mv)):
+            found, local = out[i, j, a], part[first_v[j] :]
             for b in range(q):
                 total = 0.0
                 for k in range(q):
-                    total += part[a, k] * mv[j, b, k]
-                out[i, j, a, b] = total
+                    total += mv[j, b, k] * local[k]
+                found[b] = total
 
 
 @njit(entry=True, **FAST)
@@ -82,26 +82,21 @@ def pull_coefficients(i, grads, first_u, mu, first_v, mv, rows, out):
                     out[first_u[k] + a, j] += rows[k, a, j]
         return
     p, q = mu.shape[1], mv.shape[1]
-    total, part = np.empty((p, q)), np.empty((p, q))
-    for j in range(len(mv)):
-        for a in range(p):
+    part = np.zeros(rows.shape[2])
+    for a in range(p):
+        part[:] = 0.0
+        for j in range(len(mv)):
+            local = part[first_v[j] :]
             for b in range(q):
                 value = 0.0
                 for block in range(len(grads)):
                     value += grads[block, i, j, a, b]
-                total[a, b] = value
-        for a in range(p):
-            for b in range(q):
-                value = 0.0
                 for k in range(q):
-                    value += total[a, k] * mv[j, k, b]
-                part[a, b] = value
-        for a in range(p):
-            for b in range(q):
-                value = 0.0
-                for k in range(p):
-                    value += mu[i, k, a] * part[k, b]
-                rows[i, a, first_v[j] + b] += value
+                    local[k] += value * mv[j, b, k]
+        for k in range(p):
+            weight, row = mu[i, a, k], rows[i, k]
+            for j in range(len(part)):
+                row[j] += weight * part[j]
 
 
 @njit(inline="always", **FAST)

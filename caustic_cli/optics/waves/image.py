@@ -19,6 +19,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.emission.coherent import Mode, central_mode, modes, outermost_modes, spots
 from caustic_cli.optics.image import with_colour
 from caustic_cli.optics.interaction import Parameters
@@ -26,9 +27,17 @@ from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.spread import POINT, Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
-from caustic_cli.optics.waves.propagation import cells, phase_of, power_by_blocks, power_on_pixels
+from caustic_cli.optics.waves.propagation import (
+    TURN,
+    Exposure,
+    cells,
+    phase_of,
+    pixel_edges,
+    power_by_blocks,
+    power_on_pixels,
+)
 from caustic_cli.optics.waves.sampling import Sampling, memory_free
-from caustic_cli.optics.waves.tilted import power_on_tilted
+from caustic_cli.optics.waves.tilted import TiltedExposure, power_on_tilted
 from caustic_cli.optics.waves.unsupported import NoWaveImage, receiver_of
 from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, distance_of, survey, wavefront
 from caustic_cli.scene import Light, Scene, Screen, Source
@@ -37,6 +46,8 @@ from caustic_cli.scene.materials import nearest_index
 NM = 1e-6
 #: Transform samples per second on two cores; largest number of samples of a wave image that was not requested explicitly.
 A_SECOND, UNASKED = 1e8, 120e8
+#: Bytes per sample of an image that is computed whole, in numbers of the field.
+WHOLE = 3
 #: Traced nodes per knot span of the finest surface, and their least number along an axis.
 A_SPAN, LEAST_NODES = 3, 384
 #: Largest margin of the computed region on each side of the screen, relative to the screen's width.
@@ -378,60 +389,83 @@ class Imager:
         """Convolutions on the screen's pixels: of the whole source, or of each mode of a position; empty for point sources."""
         return self.spread.convolutions(self.receiver.pixel, spots(self.source, self.each) if self.each else [])
 
-    def masks(self, line: Line, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Overlap matrices between samples and (subdivided) pixels of an upright screen, along each axis."""
-        s, low, found = self.sampling, self.receiver.extent()[0], []
+    def edges(self, line: Line) -> tuple[Tensor, Tensor]:
+        """Edges of the (subdivided) pixels of an upright screen in samples, along each axis, see `pixel_edges`."""
+        s, low = self.sampling, self.receiver.extent()[0]
         sub, beside = (self.spreading[0].cut, self.spreading[0].beside) if self.spreading else (1, (0, 0))
         first, spacing = s.first(line.behind), s.spacing(line.behind)
-        for k in (0, 1):
-            width = self.receiver.pixel[k] / sub
-            found.append(
-                cells(
-                    low[k] - beside[k] * width,
-                    width,
-                    sub * self.receiver.resolution[k] + 2 * beside[k],
-                    first[k],
-                    spacing[k],
-                    s.padded[k],
-                    device,
-                ).to(dtype)
+        rows, columns = (
+            pixel_edges(
+                low[k] - beside[k] * self.receiver.pixel[k] / sub,
+                self.receiver.pixel[k] / sub,
+                sub * self.receiver.resolution[k] + 2 * beside[k],
+                first[k],
+                spacing[k],
+                s.padded[k],
             )
-        rows, columns = found
+            for k in (0, 1)
+        )
         return rows, columns
 
     def spread_out(self, image: Tensor, mode: int) -> Tensor:
         """An image of a mode on subdivided pixels -> that of its part of the source on the screen's pixels."""
         return self.spreading[mode % len(self.spreading)](image) if self.spreading else image
 
+    def gathered(self, by_image: Tensor, mode: int, resolution: tuple[int, int]) -> Tensor:
+        """The adjoint of `spread_out`, for images of this number of subdivided pixels."""
+        if not self.spreading:
+            return by_image
+        with torch.enable_grad():
+            image = torch.zeros(resolution, dtype=by_image.dtype, device=by_image.device, requires_grad=True)
+            return torch.autograd.grad(self.spread_out(image, mode), image, by_image)[0]
+
     def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Phase, rad, including that of the Fresnel kernel, and amplitude of each sample of a wavefront, (n, m)."""
         s, front = self.sampling, self.watched(front, line.behind)
         path, amplitude = front.on(s.low, s.step, s.count).whole
-        return phase_of(path, s, line.length, line.behind).to(dtype), amplitude.to(dtype)
+        if path.requires_grad:
+            return phase_of(path, s, line.length, line.behind).to(dtype), amplitude.to(dtype)
+        return backend_for(path.device).phase(path, s, line.length, line.behind, dtype), amplitude.to(dtype)
+
+    def exposure(self, line: Line, front: Wavefront, dtype: torch.dtype) -> Exposure | TiltedExposure:
+        """Power on the (subdivided) pixels as a function of a change of the optical paths of a wavefront."""
+        if not self.receiver.across:
+            return TiltedExposure(self.receiver, self.sampling, self.watched(front, line.behind), line.length, line.behind, dtype)
+        phase, amplitude = self.field(line, front, dtype)
+        return backend_for(phase.device).exposure(phase, amplitude, TURN / line.length, self.sampling.padded, self.edges(line))
 
     def image(self, line: Line, front: Wavefront, mode: int, dtype: torch.dtype) -> tuple[Tensor, float]:
         """Power on pixels of one mode, by its number, at one wavelength, float64, and its total power."""
         s, wide = self.sampling, 8 if dtype == torch.float32 else 16
         if not self.receiver.across:
             found = power_on_tilted(self.receiver, s, self.watched(front, line.behind), line.length, line.behind, dtype)
-            return found, front.power()
-        rows, columns = self.masks(line, front.path.device, dtype)
+            return found, front.power
         if torch.is_grad_enabled() and front.path.requires_grad:
             self._check_memory(wide)
-            found = power_on_pixels(*self.field(line, front, dtype), s.padded, rows, columns).double()
+            found = power_on_pixels(*self.field(line, front, dtype), s.padded, *self._masks(line, front, dtype)).double()
+        elif s.pieces(WHOLE * wide) == 1:
+            exposure = self.exposure(line, front, dtype)
+            assert isinstance(exposure, Exposure)
+            found = exposure.image(torch.zeros_like(exposure.phase)).double()
         else:
-            found = self._by_blocks(line, self.watched(front, line.behind), s.pieces(wide), rows, columns, dtype)
-        return self.spread_out(found, mode), front.power()
+            found = self._by_blocks(line, self.watched(front, line.behind), s.pieces(wide), dtype)
+        return self.spread_out(found, mode), front.power
+
+    def _masks(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        rows, columns = (
+            cells(e.to(front.path.device), n).to(dtype) for e, n in zip(self.edges(line), self.sampling.padded, strict=True)
+        )
+        return rows, columns
 
     @torch.no_grad()
-    def _by_blocks(self, line: Line, front: Wavefront, pieces: int, rows: Tensor, columns: Tensor, dtype: torch.dtype) -> Tensor:
+    def _by_blocks(self, line: Line, front: Wavefront, pieces: int, dtype: torch.dtype) -> Tensor:
         s, fine = self.sampling, front.on(self.sampling.low, self.sampling.step, self.sampling.count)
 
         def field(part: slice) -> Tensor:
             path, root, lit = fine.rows(part)
             return torch.polar((root * lit).to(dtype), phase_of(path, s, line.length, line.behind, part).to(dtype))
 
-        return power_by_blocks(field, s, pieces, rows, columns)[0]
+        return power_by_blocks(field, s, pieces, *self._masks(line, front, dtype))[0]
 
     def _check_memory(self, wide: int) -> None:
         n, m = self.sampling.count

@@ -46,14 +46,19 @@ def phase_of(path: Tensor, sampling: Sampling, length: float, behind: float, par
     return phase.remainder_(TURN)
 
 
-def cells(low: float, width: float, count: int, first: float, spacing: float, samples: int, device: torch.device) -> Tensor:
-    """Fractions of the screen's samples, intervals of width `spacing`, inside each pixel along one axis: (count, N).
+def pixel_edges(low: float, width: float, count: int, first: float, spacing: float, samples: int) -> Tensor:
+    """Edges of the pixels along one axis, in samples of the screen, which are intervals of width `spacing`: (count + 1,) float64.
 
     low, width: of the first pixel; first: centre of the first sample; all mm.
     """
-    edges = low + width * torch.arange(count + 1, dtype=torch.float64, device=device)
-    start = first + spacing * (torch.arange(samples, dtype=torch.float64, device=device) - 0.5)
-    reach = ((edges[:, None] - start[None, :]) / spacing).clamp(0.0, 1.0)  # fraction of each sample below each edge
+    edges = low + width * torch.arange(count + 1, dtype=torch.float64)
+    return ((edges - first) / spacing + 0.5).clamp(0.0, float(samples))
+
+
+def cells(edges: Tensor, samples: int) -> Tensor:
+    """Fractions of the screen's samples inside each pixel along one axis, between edges (count + 1,): (count, N) float64."""
+    start = torch.arange(samples, dtype=torch.float64, device=edges.device)
+    reach = (edges[:, None] - start[None, :]).clamp(0.0, 1.0)  # fraction of each sample below each edge
     return reach[1:] - reach[:-1]
 
 
@@ -86,6 +91,37 @@ def power_on_pixels(phase: Tensor, amplitude: Tensor, shape: tuple[int, int], ro
         rows, columns: (a, N) and (b, M), see `cells`.
     """
     return _Illuminance.apply(phase, amplitude, shape, rows, columns)
+
+
+class Exposure:
+    """The image of light of one wavelength as a function of a change of its optical paths, and its adjoint.
+
+    Args:
+        phase, amplitude: (n, m), as of `power_on_pixels`.
+        factor: rad/mm, of the change of the path.
+        shape: (N, M) of the transform.
+        edges: of the pixels along both axes, see `pixel_edges`.
+    """
+
+    def __init__(self, phase: Tensor, amplitude: Tensor, factor: float, shape: tuple[int, int], edges: tuple[Tensor, Tensor]):
+        self.phase, self.amplitude, self.factor, self.shape, self.edges = phase, amplitude, factor, shape, edges
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """Pixels along both axes."""
+        return len(self.edges[0]) - 1, len(self.edges[1]) - 1
+
+    def image(self, change: Tensor, keep: bool = False) -> Tensor:
+        """Power on pixels (a, b) for a change (n, m) mm; keep: what takes time for the adjoint at the same change."""
+        masks = (cells(e.to(self.phase.device), n).to(self.phase) for e, n in zip(self.edges, self.shape, strict=True))
+        return power_on_pixels(self.phase + self.factor * change, self.amplitude, self.shape, *masks)
+
+    def pull(self, by_pixel: Tensor, change: Tensor, out: Tensor) -> None:
+        """Add the derivative by the change (n, m) to `out`, from that by the power on pixels (a, b)."""
+        with torch.enable_grad():
+            leaf = change.detach().requires_grad_()
+            found = self.image(leaf)
+        out += torch.autograd.grad(found, leaf, by_pixel.to(found.dtype))[0]
 
 
 @torch.no_grad()

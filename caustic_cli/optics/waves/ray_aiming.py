@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 #: Largest number of iterations, and least number at the edges of dark regions; fraction of the distance to the centre of the light
-#: by which rays that have always been blocked move in each iteration.
-TRIES, AT_EDGES, INWARDS = 16, 10, 0.02
+#: by which rays that have always been blocked move in each iteration; iterations after which the wavefront's curvature is known.
+TRIES, AT_EDGES, INWARDS, SETTLING = 16, 10, 0.02, 2
 
 
-def aimed_rays(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step: tuple[float, float], left: float) -> tuple:
+def aimed_rays(
+    optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step: tuple[float, float], left: float, sensitive: bool = False
+) -> tuple:
     """Rays with intercepts at given points of the reference plane.
 
     Args:
         optics, seen: the `Optics`, and its `Survey`.
         at: x, y (N,) of the points, mm.
         shape, step: of the grid that they form, mm.
-        left: tolerance of the path error, mm, see `_left`.
+        left: tolerance of the path error, mm; from the second iteration on only rays beyond it are traced again.
+        sensitive: as of `Optics.intercepts`.
 
     Returns:
         `Intercepts` of the rays; their points of the pupil u, v; and whether a ray was blocked at some iteration, (N,).
@@ -28,36 +33,42 @@ def aimed_rays(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], 
     x, y = at
     u, v = ((c - seen.offset[k]) / seen.scale[k] for k, c in enumerate(at))
     middle = [(0.5 * (seen.light[0][k] + seen.light[1][k]) - seen.offset[k]) / seen.scale[k] for k in (0, 1)]
-    found = behind = torch.zeros_like(x, dtype=torch.bool)
+    found, behind = torch.zeros_like(x, dtype=torch.bool), torch.zeros_like(x, dtype=torch.bool)
     held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
+    f: Any = None
+    some: Tensor | slice = slice(None)
+    curvature = torch.zeros_like(x)
     for k in range(TRIES):
-        hu, hv = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
-        f = optics.intercepts(hu, hv)
-        lit = f.power > 0
-        found, behind = found | lit, behind | ~lit
-        held_u, held_v = (torch.where(lit | ~found, h, before) for h, before in zip((hu, hv), held, strict=True))
-        held = held_u, held_v
-        settled = _left(f, x, y, shape, step, u, v, behind) <= left
-        if settled and (k + 1 >= AT_EDGES or not bool(behind.any())):
+        here = u[some].clamp(0.0, 1.0), v[some].clamp(0.0, 1.0)
+        new = optics.intercepts(*here, sensitive)
+        f = new if f is None else f.updated(some, new)
+        lit = new.power > 0
+        found[some] |= lit
+        behind[some] |= ~lit
+        ever = found[some]
+        for kept, h in zip(held, here, strict=True):
+            kept[some] = torch.where(lit | ~ever, h, kept[some])
+        inside = ~behind & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+        if k < SETTLING:
+            curvature = _curvature(f, shape, step)
+        # a displacement e from its point of the grid is an error of the path of e^2 / 2 times the wavefront's curvature
+        far = inside & (0.5 * ((x - f.x).square() + (y - f.y).square()) * curvature > left)
+        if not bool(far.any()) and (k + 1 >= AT_EDGES or not bool(behind.any())):
             break
-        ahead = (hu + (x - f.x) / seen.scale[0], hv + (y - f.y) / seen.scale[1])
-        u, v = (
-            torch.where(lit, a, torch.where(found, 0.5 * (h + b), h + INWARDS * (m - h)))
-            for a, h, b, m in zip(ahead, (hu, hv), held, middle, strict=True)
-        )
+        ahead = (here[0] + (x[some] - new.x) / seen.scale[0], here[1] + (y[some] - new.y) / seen.scale[1])
+        for c, a, h, kept, m in zip((u, v), ahead, here, held, middle, strict=True):
+            c[some] = torch.where(lit, a, torch.where(ever, 0.5 * (h + kept[some]), h + INWARDS * (m - h)))
+        some = (far | ~inside).nonzero()[:, 0]
     if bool(behind.any()):
-        f = optics.intercepts(*held)
+        some = behind.nonzero()[:, 0]
+        f = f.updated(some, optics.intercepts(*(h[some] for h in held), sensitive))
     return f, held, behind
 
 
-def _left(
-    f, x: Tensor, y: Tensor, shape: tuple[int, int], step: tuple[float, float], u: Tensor, v: Tensor, behind: Tensor
-) -> float:
-    """Bound of the error of the optical path due to a displacement e from the grid points: e^2 / 2 times the wavefront's curvature,
-    mm."""
-    inside = ~behind & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
-    if not bool(inside.any()):
-        return 0.0
-    e2 = (x - f.x).square() + (y - f.y).square()
-    curvature = sum(g.abs() for c in (f.qx, f.qy) for g in torch.gradient(c.view(shape), spacing=step, dim=(0, 1)))
-    return float((0.5 * e2.view(shape) * curvature)[inside.view(shape)].max())
+def _curvature(f, shape: tuple[int, int], step: tuple[float, float]) -> Tensor:
+    """Bound of the curvature of a wavefront at the rays of a grid, (N,) 1/mm."""
+    slopes = [torch.gradient(c.view(shape), spacing=step, dim=(0, 1)) for c in (f.qx, f.qy)]
+    bound = slopes[0][0].abs_()
+    for g in (slopes[0][1], *slopes[1]):
+        bound += g.abs_()
+    return bound.view(-1)

@@ -87,6 +87,36 @@ def power_on_tilted(r: Receiver, s: Sampling, front: Wavefront, length: float, b
     return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell
 
 
+class TiltedExposure:
+    """`propagation.Exposure` of a tilted screen; arguments: as of `power_on_tilted`."""
+
+    def __init__(self, r: Receiver, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype):
+        self.front, self.rest = front, (length, behind, dtype)
+        self.receiver, self.sampling = r, s
+        self.kept: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """Pixels along both axes."""
+        return self.receiver.resolution
+
+    def image(self, change: Tensor, keep: bool = False) -> Tensor:
+        """As of `propagation.Exposure`."""
+        with torch.set_grad_enabled(keep):
+            leaf = change.detach().requires_grad_(keep)
+            found = power_on_tilted(self.receiver, self.sampling, replace(self.front, path=self.front.path + leaf), *self.rest)
+        self.kept = (leaf, found) if keep else None
+        return found.detach()
+
+    def pull(self, by_pixel: Tensor, change: Tensor, out: Tensor) -> None:
+        """As of `propagation.Exposure`."""
+        if self.kept is None:
+            self.image(change, keep=True)
+        assert self.kept is not None
+        (leaf, found), self.kept = self.kept, None
+        out += torch.autograd.grad(found, leaf, by_pixel)[0]
+
+
 def _through(s, path, amplitude, foot, maps, point, normal, here, length, behind, dtype, pixel) -> Tensor:
     """Irradiance at the screen's sample points near one plane, 0 elsewhere."""
     u = torch.polar(amplitude.to(dtype), phase_of(path, s, length, behind).to(dtype))

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -33,6 +34,7 @@ from caustic_cli.optics.effects import Requests
 from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.receiver import NormalPlane, dot
+from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.optics.waves.interpolation import FineWavefront, Lit, extrapolated, interpolate, lagrange_weights
@@ -44,7 +46,7 @@ from caustic_cli.scene.screen import passed_by
 #: Points along each side of the pupil for a survey; fraction of rays outside the quantiles `mostly`.
 SURVEY, FEW = 65, 0.01
 #: Tolerance of ray aiming: error of the optical path relative to the wavelength.
-LEFT = 1e-3
+LEFT = 1e-4
 #: The same for exact derivatives, whose error is of first order in the displacement.
 LEFT_EXACT = 1e-9
 CROSSES = (
@@ -65,7 +67,8 @@ SOFT = 0.02
 @dataclass
 class Intercepts:
     """Rays by their intercepts, (N,) each: x, y, path v, direction cosines qx, qy, landing points X, Y, and power, a density on the
-    pupil; see the module."""
+    pupil; see the module.  On request at_x, at_y, mm, the points of the last surface, and sensitivity, the derivative of the path
+    by its height."""
 
     x: Tensor
     y: Tensor
@@ -75,6 +78,19 @@ class Intercepts:
     big_x: Tensor
     big_y: Tensor
     power: Tensor
+    at_x: Tensor | None = None
+    at_y: Tensor | None = None
+    sensitivity: Tensor | None = None
+
+    def columns(self) -> list[Tensor]:
+        """Those that there are."""
+        return [c for c in vars(self).values() if c is not None]
+
+    def updated(self, some: Tensor | slice, new: Intercepts) -> Intercepts:
+        """These, with other rays in place of `some`; in place."""
+        for column, other in zip(self.columns(), new.columns(), strict=True):
+            column[some] = other
+        return self
 
 
 @dataclass(frozen=True)
@@ -104,15 +120,16 @@ class Optics:
         rays = self.mode.through(u, v, self.system.object_space.index_at(self.label))
         return Tracer(self.system, rays, requests=STAGES, wavelength=self.label).last(self.parameters)
 
-    def intercepts(self, u: Tensor, v: Tensor) -> Intercepts:
-        """Intercepts of the rays through points (N,) of the pupil."""
+    def intercepts(self, u: Tensor, v: Tensor, sensitive: bool = False) -> Intercepts:
+        """Intercepts of the rays through points (N,) of the pupil; sensitive: with those at the last surface."""
         parts = []
-        step = len(u) if torch.is_grad_enabled() else CHUNK
-        for start in range(0, len(u), step):
-            parts.append(self.intercepts_of(self.interactions(u[start : start + step], v[start : start + step])))
+        step = max(1, len(u)) if torch.is_grad_enabled() else CHUNK
+        for start in range(0, max(1, len(u)), step):
+            met = self.interactions(u[start : start + step], v[start : start + step])
+            parts.append(_with_last(met, self.intercepts_of(met)) if sensitive else self.intercepts_of(met))
         if len(parts) == 1:
             return parts[0]
-        return Intercepts(*(torch.cat([getattr(p, name) for p in parts]) for name in Intercepts.__dataclass_fields__))
+        return Intercepts(*(torch.cat(c) for c in zip(*(p.columns() for p in parts), strict=True)))
 
     def landing(self, mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Landing points X, Y of another mode's light, mm, its power, and its points on the last element, mm."""
@@ -226,6 +243,30 @@ class LastSurface:
         return height(self.x.reshape(-1), self.y.reshape(-1)).view(self.x.shape)
 
 
+class PathChange:
+    """Change of the optical paths of a wavefront by a change of the last surface's heights, to first order, and its adjoint.
+
+    Args:
+        surface: spline spaces of the heights.
+        last: the rays at that surface, (n, m).
+        dtype: of the change.
+    """
+
+    def __init__(self, surface: HeightField, last: LastSurface, dtype: torch.dtype):
+        self.surface, self.last, self.dtype = surface, last, dtype
+
+    def of(self, heights: Tensor) -> Tensor:
+        """(n, m) mm, of a change of the heights, mm."""
+        moved = self.last.displacement(lambda x, y: self.surface.evaluate(heights, x, y)[0])
+        return (self.last.sensitivity * moved).to(self.dtype)
+
+    def pull(self, by: Tensor) -> Tensor:
+        """The derivative by the heights, float64, from that by the change of the paths (n, m)."""
+        with torch.enable_grad():
+            heights = torch.zeros([s.n for s in self.surface.spaces], dtype=torch.float64, device=by.device, requires_grad=True)
+            return torch.autograd.grad(self.of(heights), heights, by)[0]
+
+
 @dataclass
 class Wavefront:
     """The wavefront on a uniform grid of intercepts, (n, m) float64 each."""
@@ -245,13 +286,19 @@ class Wavefront:
 
     def within(self, middle: tuple[float, float], width: tuple[float, float]) -> Wavefront:
         """The wavefront tapered to light that lands within a rectangle on the screen, mm; itself if that is all."""
-        density, lit = self.density, self.density > 0
-        for big, m, w in zip(self.landing, middle, width, strict=True):
-            inside = ((0.5 * w - (big - m).abs()) / (SOFT * w)).clamp(0.0, 1.0)
-            if bool(((inside < 1.0) & lit).any()):
-                density = density * inside
+        density = self.density
+        for big, ends, m, w in zip(self.landing, self.lands, middle, width, strict=True):
+            if max(m - ends[0], ends[1] - m) > (0.5 - SOFT) * w:
+                density = density * ((0.5 * w - (big - m).abs()) / (SOFT * w)).clamp(0.0, 1.0)
         return self if density is self.density else replace(self, density=density)
 
+    @cached_property
+    def lands(self) -> tuple[tuple[float, float], ...]:
+        """Limits of the landing points of the light along each axis, mm."""
+        lit = self.density > 0
+        return tuple((float(big[lit].min()), float(big[lit].max())) for big in self.landing)
+
+    @cached_property
     def power(self) -> float:
         """Total power."""
         return float((self.density.detach() * self.lit.fraction(self.step).detach()).sum()) * self.step[0] * self.step[1]
@@ -296,12 +343,9 @@ def wavefront(
     shape = (len(x), len(y))
     x, y = (c.reshape(-1) for c in torch.meshgrid(x, y, indexing="ij"))
     with torch.no_grad():
-        f, held, behind = aimed_rays(optics, seen, (x, y), shape, step, left)
-    last: LastSurface | None = None
-    if sensitive:
-        with torch.no_grad():
-            f, last = _sensitive(optics, held, shape)
-    elif differentiable:
+        f, held, behind = aimed_rays(optics, seen, (x, y), shape, step, left, sensitive)
+    last = LastSurface(*(c.view(shape) for c in (f.at_x, f.at_y, f.sensitivity))) if sensitive else None
+    if differentiable:
         f = optics.intercepts(*held)
     ex, ey = x - f.x, y - f.y
     path = f.path + optics.index * (f.qx * ex + f.qy * ey)
@@ -355,18 +399,12 @@ def _density(
     return density, Lit(edge_x, edge_y, (~dark).double() if bool(dark.any()) else None)
 
 
-def _sensitive(optics: Optics, through: tuple[Tensor, Tensor], shape: tuple[int, int]) -> tuple[Intercepts, LastSurface]:
-    """Intercepts of rays through points of the pupil, and the rays at the last surface, as grids of this shape."""
-    (u, v), rays, found = through, [], []
-    for start in range(0, len(u), CHUNK):
-        m = optics.interactions(u[start : start + CHUNK], v[start : start + CHUNK])
-        rays.append(optics.intercepts_of(m))
-        into = m.hit.incoming[2]
-        normal = m.element.pose.axes[2]
-        out = sum(c * a for c, a in zip(m.state.full(m.state.direction), normal, strict=True))
-        found.append((*(c.expand(out.shape) for c in m.hit.local[:2]), m.n_in * into - m.n_out * out))
-    f = Intercepts(*(torch.cat([getattr(p, name) for p in rays]) for name in Intercepts.__dataclass_fields__))
-    return f, LastSurface(*(torch.cat(c).view(shape) for c in zip(*found, strict=True)))
+def _with_last(m: Interaction, f: Intercepts) -> Intercepts:
+    """Intercepts of rays behind the last element, with those at its surface."""
+    into, normal = m.hit.incoming[2], m.element.pose.axes[2]
+    out = sum(c * a for c, a in zip(m.state.full(m.state.direction), normal, strict=True))
+    x, y = (c.expand(out.shape) for c in m.hit.local[:2])
+    return replace(f, at_x=x, at_y=y, sensitivity=m.n_in * into - m.n_out * out)
 
 
 def device_of(optics: Optics) -> torch.device:
