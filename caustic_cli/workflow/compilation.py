@@ -83,9 +83,10 @@ def compile_usual(device: str, say: Reporter, gradient: bool = True) -> None:
 
 
 def compile_design(stages: Iterable[Stage], device: str) -> None:
-    """Have other processes compile the kernels that a design with these stages is going to use, while this one goes on."""
+    """Have other processes compile the kernels that a design with these stages is going to use, while this one goes on; those of
+    spare stages are compiled when they are needed."""
     if backend_for(device).compiled:
-        by_waves = {bool(stage.waves) for stage in stages}
+        by_waves = {bool(stage.waves) or stage.spare for stage in stages}
         parts = {"refraction": True in by_waves, "adjoint": False in by_waves}
         compile_behind(part for part in PARTS if parts.get(part, True))
 

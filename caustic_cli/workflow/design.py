@@ -277,7 +277,7 @@ def resume(
 def _compile(problem: OneSurface, say: Reporter) -> None:
     """Compile the kernels of iterations on rays before the first; those of the wave image and of the evaluation are compiled by
     other processes, or when they are needed."""
-    if all(stage.waves for stage in problem.stages):
+    if all(stage.waves or stage.spare for stage in problem.stages):
         compile_design(problem.stages, problem.device)
     else:
         compile_for(problem.scene, problem.device, say, gradient=True)
