@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from importlib import import_module
 from typing import Any
 
@@ -14,3 +16,12 @@ class OnDemand:
 
     def __getattr__(self, attribute: str) -> Any:
         return getattr(import_module(self._name), attribute)
+
+    def _load(self) -> None:
+        with contextlib.suppress(Exception):  # which its first use raises again
+            import_module(self._name)
+
+
+def load_behind(module: OnDemand) -> None:
+    """Load a module that is going to be used, in another thread."""
+    threading.Thread(target=module._load, name="loading").start()

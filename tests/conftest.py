@@ -15,6 +15,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from caustic_cli.commands import parser
+from caustic_cli.optics.kernels import ahead
 
 with warnings.catch_warnings():  # torch loads this module on the first forward-mode derivative, and it warns of torch itself
     warnings.simplefilter("ignore", DeprecationWarning)
@@ -70,6 +71,12 @@ SLOW = (
     "test_tolerances.py",
     "test_verify.py",
 )
+
+
+def pytest_sessionstart(session):
+    """With an empty cache, the kernels of most tests are compiled while these are collected: once for all processes of xdist."""
+    if not hasattr(session.config, "workerinput"):
+        ahead.compile_behind(ahead.PARTS)
 
 
 def pytest_collection_modifyitems(items):

@@ -169,6 +169,7 @@ ELSEWHERE = {
     ("export/page/__init__.py", "(here / f'page.{kind}').read_text"),
     ("optics/kernels/cache.py", "p.read_bytes"),
     ("optics/kernels/cache.py", "path.read_bytes"),
+    ("optics/kernels/cache.py", "os.open"),
     ("io/picture.py", "open"),
     ("cli.py", "open"),
     ("cli.py", "os.open"),

@@ -28,6 +28,20 @@ RUN = """
 from caustic_cli.optics.kernels.probe import probe
 print(probe(0.0), sum(probe.stats.cache_hits.values()), sum(probe.stats.cache_misses.values()))
 """
+#: Kills the process as soon as a function is compiled.
+DIES = """
+import os, signal
+from numba.core import event
+
+class Killer(event.Listener):
+    def on_start(self, event):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Killer())
+"""
 
 
 def run(code: str, package: Path, **variables: str | None) -> list[str]:
@@ -47,7 +61,6 @@ def package(tmp_path) -> Path:
     copy = tmp_path / "site" / "caustic_cli"
     shutil.copytree(cache.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     (copy / "optics" / "kernels" / "probe.py").write_text(PROBE)
-    (copy / "optics" / "kernels" / "__init__.py").write_text("")  # which loads torch, that PROBE needs nothing of
     return copy
 
 
@@ -73,6 +86,21 @@ def test_installations_of_the_same_sources_share_what_is_kept(package, tmp_path)
     shutil.copytree(package, other)
     os.utime(other / "optics" / "kernels" / "probe.py", (1e9, 1e9))
     assert run(RUN, other, NUMBA_CACHE_DIR=kept) == ["1.0", "1", "0"]
+
+
+def test_processes_that_start_together_compile_a_function_once(package, tmp_path):
+    """Whichever is first, the other loads what it stored; one that is killed while it compiles does not hold up the others."""
+    env = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+
+    def started(code: str) -> subprocess.Popen:
+        return subprocess.Popen([sys.executable, "-c", code], cwd=package.parent, env=env, stdout=subprocess.PIPE, text=True)
+
+    dying = started(DIES + RUN)
+    dying.communicate()
+    assert dying.returncode == -9
+    with started(RUN) as one, started(RUN) as other:
+        found = [process.communicate()[0].split() for process in (one, other)]
+    assert sorted(found) == [["1.0", "0", "1"], ["1.0", "1", "0"]]
 
 
 def test_damaged_files_are_made_anew(package, tmp_path):

@@ -16,10 +16,11 @@ import torch
 from helpers import pairwise
 
 from caustic_cli.commands import console
+from caustic_cli.inverse import transport
 from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import IDENTITY
-from caustic_cli.optics.kernels import banded, fused, pixels, spline
+from caustic_cli.optics.kernels import ahead, banded, fused, multigrid, pixels, random_points, refraction, spline
 from caustic_cli.optics.kernels import filter_weights as kernel_shares
 from caustic_cli.optics.kernels.fused_functions import PlaneKernel
 from caustic_cli.optics.kernels.jit import njit
@@ -29,6 +30,7 @@ from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
+from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 from caustic_cli.workflow import compilation
 
@@ -239,14 +241,19 @@ def test_series_and_recursion_meet():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
     """A kernel that is called in another way than it was compiled ahead for would be compiled again, half a minute each time."""
-    for part in compilation.PARTS:
-        compilation.compile_part(part)
-    kernels = (fused.forward, fused.backward, pixels.sums, spline.evaluate, spline.pull_back, banded._contract, banded._spread)
-    ahead = [list(kernel.signatures) for kernel in kernels]
+    for part in ahead.PARTS:
+        ahead.compile_part(part)
+    kernels = [fused.forward, fused.backward, pixels.sums, spline.evaluate, spline.pull_back, banded._contract, banded._spread]
+    kernels += [spline.evaluate_net, spline.pull_coefficients, refraction.refract, random_points.scatter]
+    kernels += [multigrid.matrix, multigrid._coarsen, multigrid._sweep, multigrid._residual]
+    assert {name for name, _ in ahead.PARTS.values()} <= {f"{k.__module__.rpartition('.')[2]}.{k.__name__}" for k in kernels}
+    compiled = [list(kernel.signatures) for kernel in kernels]
     for kind, rays in (("lines", 900), ("stratified", 1500), ("uniform", 900), ("uniform", 1)):
         image, *_ = next(exposures(scene("schlick"), heights().requires_grad_(), FILTERS[-1], kind, dtype, rays))
         image.sum().backward()
-    assert [list(kernel.signatures) for kernel in kernels] == ahead
+    transport.solve(np.ones((8, 8)), np.ones((64, 64)), (1.0, 1.0), (1.0, 1.0))
+    wave_image(scene(), HeightField.of(scene().lens), heights(rough=0.0).requires_grad_()).image.sum().backward()
+    assert [list(kernel.signatures) for kernel in kernels] == compiled
 
 
 def test_compilation_is_spoken_of_where_something_is_compiled(monkeypatch):
@@ -266,14 +273,6 @@ def test_compilation_is_spoken_of_where_something_is_compiled(monkeypatch):
         slow(2.0)
         time.sleep(0.1)
     assert said == ["compiling"]
-
-
-def test_parts_of_the_first_run_are_shared_out():
-    for processes in range(1, 5):
-        shares = compilation.partition(processes)
-        assert sorted(part for share in shares for part in share) == sorted(compilation.PARTS)
-        assert len(shares) == processes
-        assert all(shares)
 
 
 @njit(entry=True)

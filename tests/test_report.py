@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from itertools import combinations
 
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 
+from caustic_cli.loading import OnDemand, load_behind
 from caustic_cli.scene import Lens, Screen
 from caustic_cli.scene.tolerances import Parameter
 from caustic_cli.studies import tolerances as study
@@ -19,11 +22,22 @@ from caustic_cli.studies.design_report import write_report
 TOUCH = 2.0
 
 
+def test_what_is_loaded_behind_is_there_and_its_errors_are_those_of_its_use():
+    for module in (there := OnDemand("caustic_cli.studies.design_report"), absent := OnDemand("caustic_cli.studies.absent")):
+        load_behind(module)
+    for thread in threading.enumerate():
+        if thread.name == "loading":
+            thread.join()
+    assert there.write_report is write_report
+    with pytest.raises(ModuleNotFoundError):
+        _ = absent.write_report
+
+
 @pytest.fixture
 def drawn(monkeypatch) -> list[Figure]:
     """The figures that were saved."""
     found: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: (figure.canvas.draw(), found.append(figure)))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: (FigureCanvasAgg(figure).draw(), found.append(figure)))
     return found
 
 

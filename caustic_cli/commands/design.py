@@ -73,6 +73,10 @@ def run(asked: DesignOptions) -> None:
     project, picture = target if target.is_dir() else path, target
     if speaks:
         picture = _check_before_torch(asked, project)
+        if not asked.resume:  # as early as possible, while this process loads the libraries
+            from caustic_cli.optics.kernels.ahead import compile_behind  # noqa: PLC0415
+
+            compile_behind(["multigrid"], more=True)
     device = asked.start_torch()
 
     from caustic_cli.inverse import ranks  # noqa: PLC0415

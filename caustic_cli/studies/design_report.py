@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import FuncNorm, Normalize
+from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
@@ -112,12 +113,7 @@ def write_report(
         stages: of each, the blur in its loss, pixels, and whether it uses the wave image.
         colours: of the image by rays and by waves, where they are shown in colour.
     """
-    import matplotlib  # noqa: PLC0415
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415
-
-    figure = plt.figure(figsize=(22.0, 9.8))
+    figure = Figure(figsize=(22.0, 9.8))
     axes = figure.subplots(2, 4, gridspec_kw=PLACES)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
     shown = _images(image, waves, figures, colours)
@@ -142,7 +138,6 @@ def write_report(
     _draw_relief(solid, relief, (rx, ry), unit)
     with atomic_file(path) as file:
         figure.savefig(file, format="png", dpi=100, metadata={"Software": SOFTWARE})
-    plt.close(figure)
 
 
 def _images(image: np.ndarray, waves: np.ndarray | None, figures: dict, colours: Sequence[Colours | None]) -> list[Shown]:

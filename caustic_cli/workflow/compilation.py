@@ -1,30 +1,21 @@
-"""Selection of the device, and compilation of its kernels: in parallel subprocesses on the first run on a machine.
-
-Subprocesses write to the cache in `kernels.cache.DIRECTORY`, from which this process loads the kernels; it compiles any that are
-missing itself.
-"""
+"""Selection of the device, and compilation of its kernels: on the first run on a machine, which other processes share (`ahead`)."""
 
 from __future__ import annotations
 
-import itertools
-import os
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import torch
 from numba.core import event
 
 from caustic_cli.errors import is_out_of_memory
+from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.backends import backend_for, cuda_kernels
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.kernels import cache
+from caustic_cli.optics.kernels.ahead import PARTS, compile_behind, compile_part
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
@@ -34,10 +25,6 @@ from caustic_cli.workflow.reporter import Reporter
 
 #: Seconds of compilation before the user is told.
 PATIENCE = 2.0
-#: Independent parts, and approximate compilation time of each, s.
-PARTS = {"adjoint": 5.0, "transport": 5.5, "splat": 4.0, "surface": 2.8}
-#: Parts that share functions, and the time saved by compiling them in the same process, s.
-ALIKE, SAVED = {"adjoint", "splat"}, 2.2
 
 
 def choose_device(asked: str, say: Reporter) -> str:
@@ -54,66 +41,6 @@ def choose_device(asked: str, say: Reporter) -> str:
         return "cpu"
     say.say(f"tracing on {name} in plain torch: {lacking}")
     return "cuda"
-
-
-def is_cached() -> bool:
-    """Whether the cache holds compiled kernels, judged by file names; also True if nothing can be cached."""
-    place = backend_for("cpu").cache_path()
-    return cache.DIRECTORY is None or place is None or any(Path(place).glob("fused.backward-*.nbi"))
-
-
-def compile_part(part: str) -> None:
-    """Compile one of PARTS into the cache, by calling it."""
-    if part != "transport":
-        backend_for("cpu").compile_part(part)
-    else:
-        from caustic_cli.inverse import transport  # noqa: PLC0415
-
-        for light in (np.ones((8, 8)), np.arange(1.0, 65.0).reshape(8, 8)):
-            transport.solve(light, np.ones((64, 64)), (1.0, 1.0), (1.0, 1.0))
-
-
-def partition(processes: int) -> list[list[str]]:
-    """Partition PARTS into this number of lists with minimal longest compilation time; the longest comes first."""
-
-    def cost(parts: list[str]) -> float:
-        return sum(PARTS[p] for p in parts) - (SAVED if set(parts) >= ALIKE else 0.0)
-
-    ways = [
-        [[p for p, at in zip(PARTS, way, strict=True) if at == k] for k in range(processes)]
-        for way in itertools.product(range(processes), repeat=len(PARTS))
-        if len(set(way)) == processes
-    ]
-    return sorted(min(ways, key=lambda lists: sorted(map(cost, lists), reverse=True)), key=cost, reverse=True)
-
-
-def compile_side_by_side() -> None:
-    """Compile all PARTS in parallel, on the cores available to this process."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    mine, *others = partition(min(len(PARTS), cores))
-    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    env = os.environ | {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(cache.DIRECTORY.parent)}  # the same cache for subprocesses
-    running: list[subprocess.Popen] = []
-    try:
-        for parts in others:
-            running.append(
-                subprocess.Popen(
-                    [sys.executable, "-m", __name__, *parts],
-                    env=env,
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                )
-            )
-        for part in mine:
-            compile_part(part)
-        for process in running:
-            process.wait()
-    finally:  # also after an interrupt: no subprocess is left running
-        for process in running:
-            process.terminate()
-        for process in running:
-            process.wait()
 
 
 class _Compiled(event.Listener):
@@ -145,14 +72,23 @@ def announce_compilation(say: Reporter, text: str) -> Iterator[None]:
         yield
 
 
-def compile_usual(device: str, say: Reporter) -> None:
-    """Compile the kernels that every design and render uses, if the backend of the device is compiled."""
+def compile_usual(device: str, say: Reporter, gradient: bool = True) -> None:
+    """Compile the kernels for plane waves, if the backend of the device is compiled; gradient: and their adjoint."""
     if not backend_for(device).compiled:
         return
+    compile_behind(["image"])
     with announce_compilation(say, "compiling the kernels for this machine, once: about ten seconds"):
-        if not is_cached():
-            compile_side_by_side()
-        backend_for(device).compile_plane()
+        for part in ("surface", "adjoint", "image") if gradient else ("surface", "image"):
+            compile_part(part)
+
+
+def compile_design(stages: Iterable[Stage], device: str) -> None:
+    """Have other processes compile the kernels that a design with these stages is going to use, while this one goes on; those of
+    spare stages are compiled when they are needed."""
+    if backend_for(device).compiled:
+        by_waves = {bool(stage.waves) or stage.spare for stage in stages}
+        parts = {"refraction": True in by_waves, "adjoint": False in by_waves}
+        compile_behind(part for part in PARTS if parts.get(part, True))
 
 
 def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Requests | None = None, gradient: bool = False) -> None:
@@ -163,7 +99,7 @@ def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Reque
         requests: of a plan, or None.
         gradient: also compile derivatives.
     """
-    compile_usual(device, say)
+    compile_usual(device, say, gradient)
     if not backend_for(device).compiled:
         return
     wanted = [(scene, requests or NO_REQUESTS)]
@@ -180,11 +116,6 @@ def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Reque
         except (MemoryError, RuntimeError) as problem:
             if not is_out_of_memory(problem):  # out of memory is handled, and kernels compiled, during the actual work
                 raise
-
-
-if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        compile_part(name)
 
 
 def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = False) -> None:

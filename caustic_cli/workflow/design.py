@@ -44,8 +44,8 @@ from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.schema.table import TABLE, LensSettings
-from caustic_cli.workflow.compilation import announce_compilation, compile_usual
-from caustic_cli.workflow.evaluation import evaluate_and_write, evaluation_seconds, expected_seconds
+from caustic_cli.workflow.compilation import announce_compilation, compile_design, compile_for
+from caustic_cli.workflow.evaluation import evaluate_and_write, evaluation_seconds, expected_seconds, prepare_report
 from caustic_cli.workflow.movie import NoMovie
 from caustic_cli.workflow.reporter import Reporter
 
@@ -59,6 +59,7 @@ DONE = ("iterations", "no progress")
 #: Fractions of a time limit: least for the iterations, whatever the initial surface took; and most for the initial surface.
 LEAST_PART, START_PART = 0.25, 0.3
 NO_MOVIE = NoMovie()
+COMPILING = "compiling the kernels for this machine, once: about ten seconds"
 #: Time of a checkpoint, s, beyond which the interval to the next one grows, and the factor of the excess.
 QUICK, RARELY = 0.5, 10.0
 
@@ -119,9 +120,9 @@ def prepare(
     problem.refuse_unreachable()
     if words := shape_words(project.settings):
         say.say(words)
-    compile_usual(device, say)
+    compile_design(problem.stages, device)
     with (
-        announce_compilation(say, "compiling the kernels of the transport, once: about half a minute"),
+        announce_compilation(say, COMPILING),
         say.notify_if_slow("solving the transport of the light to the picture"),
     ):
         try:
@@ -191,6 +192,7 @@ def design(prepared: PreparedDesign, device: str, say: Reporter, began: float, m
     if problem is None:
         return _again(project, device, say, began, movie)
     with project.hold:
+        _compile(problem, say)
         if not problem.in_stages:
             return _run_index(project, problem, say, began)
         _say_limits(project, problem, first, say)
@@ -254,6 +256,7 @@ def resume(
         project.hold.enter_context(directory.locked(project.path))
         problem = problem_of(project, device)
         problem.refuse_obstructed()
+        _compile(problem, say)
         designer = Designer(problem)
         has_checkpoint = (project.path / CHECKPOINT).exists()  # else it was killed before its first checkpoint
         checkpoint = project.load() if has_checkpoint else None
@@ -269,6 +272,15 @@ def resume(
             project.write_settings()
         project = replace(project, asked=uptodate.asked_of(project, checkpoint) if has_checkpoint else uptodate.begun(project))
         return _run(project, problem, state, say, began, time_limit, movie)
+
+
+def _compile(problem: OneSurface, say: Reporter) -> None:
+    """Compile the kernels of iterations on rays before the first; those of the wave image and of the evaluation are compiled by
+    other processes, or when they are needed."""
+    if all(stage.waves or stage.spare for stage in problem.stages):
+        compile_design(problem.stages, problem.device)
+    else:
+        compile_for(problem.scene, problem.device, say, gradient=True)
 
 
 def _refuse_edited(project: Project, designer: Designer, state: State) -> None:
@@ -424,7 +436,8 @@ def _run(
     records = _Records(project, designer)
     watch = _Watch(project, designer, records, say, movie)
     movie.begin(problem.scene)
-    with _signals(project.path is not None) as asked:
+    prepare_report(project, designer)
+    with announce_compilation(say, COMPILING), _signals(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
             records.keep(state)
             ranks.send((project.settings, project.picture, _on_cpu(state), limit))

@@ -13,7 +13,7 @@ from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import discard
 from caustic_cli.io.picture import WIDE, write_image
 from caustic_cli.kinds.evaluation import Evaluated
-from caustic_cli.loading import OnDemand
+from caustic_cli.loading import OnDemand, load_behind
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -74,6 +74,12 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
         [None if a is None else partial(in_colour, scene, a) for a in (xyz, evaluated.waves_xyz)],
     )
     return evaluated
+
+
+def prepare_report(project: Project, designer: Designer) -> None:
+    """Load what draws the report, while the iterations run."""
+    if project.path is not None and designer.problem.effort.report:
+        load_behind(design_report)
 
 
 def expected_seconds(designer: Designer, state: State) -> float:

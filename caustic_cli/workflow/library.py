@@ -36,7 +36,6 @@ from caustic_cli.optics.trace import tracers
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.lens import Lens, Render, count, load
 from caustic_cli.workflow.movie import recorder
 from caustic_cli.workflow.reporter import Listener, Reporter
@@ -153,7 +152,6 @@ def design_of(
         say=say,
         device=device,
     )
-    compile_for(prepared.scene, device, say, gradient=True)
     return _lens(workflow.design(prepared, device, say, began, recording), device)
 
 
@@ -177,9 +175,7 @@ def resume(
         InputError: there is no project, or it was edited into another design.
     """
     began, say, recording = time.monotonic(), say or Listener(), recorder(movie, force)
-    project = Project.open(path)
-    compile_for(project.scene(), device, say, gradient=True)
-    return _lens(workflow.resume(project, iterations, time_limit, device, say, began, recording), device)
+    return _lens(workflow.resume(Project.open(path), iterations, time_limit, device, say, began, recording), device)
 
 
 def _lens(done: workflow.Result, device: str) -> Lens:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -145,6 +144,8 @@ def _drawn(frame: Frame) -> Image.Image:
     sheet = Image.new(picture.mode, (width, HEIGHT + 2 * LINE + 8))
     sheet.paste(picture, ((width - picture.width) // 2, 0))
     draw = ImageDraw.Draw(sheet)
+    import matplotlib  # noqa: PLC0415 - for its font
+
     font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), LETTERS)
     for k, (line, shade) in enumerate(zip(frame.words, (235, 170), strict=True)):
         draw.text((10, HEIGHT + 4 + k * LINE), line, fill=shade if sheet.mode == "L" else (shade,) * 3, font=font)

@@ -17,7 +17,7 @@ from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.gradient.fields import LEAST_SQUARE, SplineIndex
 from caustic_cli.optics.gradient.integrator import WEIGHTS, Flow
 from caustic_cli.optics.interface import OutgoingRays
-from caustic_cli.optics.kernels import fused, fused_functions
+from caustic_cli.optics.kernels import fused_functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
 from caustic_cli.optics.kernels.pencil import PencilKernel
@@ -41,22 +41,6 @@ class Numba(Torch):
 
     name = "numba"
     compiled = True
-
-    def compile_plane(self) -> None:
-        """Load the kernels for plane waves from the cache, or compile them."""
-        fused_functions.compile_kernels()
-
-    def compile_part(self, name: str) -> None:
-        """Compile the part of them with that name: splat, adjoint or surface."""
-        {
-            "splat": fused_functions.compile_splat,
-            "adjoint": fused_functions.compile_adjoint,
-            "surface": fused_functions.compile_surface,
-        }[name]()
-
-    def cache_path(self) -> str | None:
-        """Directory of the compiled kernels for plane waves; None if nothing can be cached."""
-        return fused.backward.stats.cache_path
 
     def precision(self, dtype: torch.dtype) -> torch.dtype:
         """float64."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 
-import torch
-
 #: numba uses OpenMP threads, as torch does.  Its default is TBB, whose parallel loops became slower to start in measurements: from
 #: 26 microseconds at first to 500 after 20,000 of them; those of OpenMP take 3 throughout.
 THREADING = ["omp", "workqueue", "tbb"]
@@ -13,6 +11,8 @@ THREADING = ["omp", "workqueue", "tbb"]
 
 def blocks() -> int:
     """Number of blocks of rays, each with its own partial sums: the number of torch's threads, which numba uses, too."""
+    import torch  # noqa: PLC0415, I001 - first, whose OpenMP numba uses, too
+
     import numba  # noqa: PLC0415
 
     if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:

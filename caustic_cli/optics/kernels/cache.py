@@ -9,12 +9,14 @@ together with the versions of numba and Python, has its own directory `caustic-<
     that is read-only;
     caustic-<user> in the system's temporary directory, if only this user can write to it, since numba unpickles its files,
 
-that is writable.  If none is, kernels are compiled again in every process.
+that is writable.  If none is, kernels are compiled again in every process.  Processes that start together share the work: a
+function that one of them compiles the others wait for (`claim`).
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import platform
@@ -23,15 +25,26 @@ import shutil
 import stat
 import tempfile
 import time
+import zlib
 from collections.abc import Iterator
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows, where processes that start at the same time compile the same functions
+    fcntl = None  # type: ignore[assignment]
 
 PACKAGE = Path(__file__).resolve().parents[2]
 PREFIX, DIGITS = "caustic-", 20
 #: Marker file in each directory, touched on every use, so that its age shows how long the directory has been unused.
 USED = "last-used"
 KEPT_DAYS = 30.0
+#: File of each directory in which a process that compiles a function locks the byte whose position follows from its name.
+LOCKS = "locks"
+#: Longest time, s, to wait for another process, which may have been stopped, and the time between two attempts.
+LONGEST, PAUSE = 60.0, 0.01
 
 
 def sources(package: Path = PACKAGE) -> list[Path]:
@@ -109,6 +122,34 @@ def tidy(directory: Path, days: float = KEPT_DAYS) -> None:
                 continue
             if used.stat().st_mtime < before:
                 shutil.rmtree(path, ignore_errors=True)
+
+
+@lru_cache(maxsize=1)
+def _locks() -> int | None:
+    """File descriptor of LOCKS, open until the process ends, since closing it would release all its locks; None if it cannot be."""
+    with contextlib.suppress(OSError):
+        return None if fcntl is None or DIRECTORY is None else os.open(DIRECTORY / LOCKS, os.O_RDWR | os.O_CREAT, 0o666)
+    return None
+
+
+def claim(function: str) -> None:
+    """Wait while another process compiles a function; from then on others wait for this one, until it calls `release` or ends."""
+    last = time.monotonic() + LONGEST
+    while (locks := _locks()) is not None:
+        try:
+            fcntl.lockf(locks, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, zlib.crc32(function.encode()))
+            return
+        except OSError as error:
+            if error.errno not in (errno.EACCES, errno.EAGAIN) or time.monotonic() > last:  # no locks on this file system
+                return
+        time.sleep(PAUSE)
+
+
+def release(function: str) -> None:
+    """End the wait of other processes for a function, which this one has compiled and stored."""
+    if (locks := _locks()) is not None:
+        with contextlib.suppress(OSError):
+            fcntl.lockf(locks, fcntl.LOCK_UN, 1, zlib.crc32(function.encode()))
 
 
 #: Of this process, found once.

@@ -202,13 +202,6 @@ def _strided(array: np.ndarray) -> np.ndarray:
 _NONE = _strided(np.zeros((2, 2)))
 
 
-def compile_kernels() -> None:
-    """Load the kernels for plane waves from the cache, or compile them."""
-    compile_surface()
-    compile_splat()
-    compile_adjoint()
-
-
 def compile_surface() -> None:
     """Compile the evaluation of the surface at rays of a plane wave, and its adjoint."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, ROW, dtype=torch.float64)

@@ -72,7 +72,17 @@ class _Kept(FunctionCache):
     _impl_class = _Placed
 
     def load_overload(self, sig, target_context):
-        """The compiled code of a signature, None if there is none in the cache."""
+        """The compiled code of a signature, from another process if one is compiling it; None if there is none in the cache, and
+        other processes wait for this one from then on."""
+        found = self._stored(sig, target_context)
+        if found is None:
+            cache.claim(self._impl.filename_base)
+            found = self._stored(sig, target_context)
+            if found is not None:
+                cache.release(self._impl.filename_base)
+        return found
+
+    def _stored(self, sig, target_context):
         with contextlib.suppress(OSError, EOFError, pickle.PickleError):
             return super().load_overload(sig, target_context)
 
@@ -84,6 +94,7 @@ class _Kept(FunctionCache):
             except (EOFError, pickle.PickleError):
                 self.flush()
                 super().save_overload(sig, data)
+        cache.release(self._impl.filename_base)
 
 
 def njit(*, entry: bool = False, parallel: bool = False, **options):
