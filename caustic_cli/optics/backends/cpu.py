@@ -17,7 +17,7 @@ from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.gradient.fields import LEAST_SQUARE, SplineIndex
 from caustic_cli.optics.gradient.integrator import WEIGHTS, Flow
 from caustic_cli.optics.interface import OutgoingRays
-from caustic_cli.optics.kernels import fused_functions
+from caustic_cli.optics.kernels import fused, fused_functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
 from caustic_cli.optics.kernels.pencil import PencilKernel

@@ -57,6 +57,13 @@ def _refraction() -> None:
     FusedSurface((space, space), (1.0, 1.0)).evaluate(torch.zeros(6, 6), np.ones(1), np.ones(1))
 
 
+def _fields() -> None:
+    """The wave image and its adjoint."""
+    from caustic_cli.optics.kernels import fields  # noqa: PLC0415
+
+    fields.compile_kernels()
+
+
 def _image() -> None:
     """The image by rays of a plane wave."""
     from caustic_cli.optics.kernels import fused_functions  # noqa: PLC0415
@@ -79,6 +86,7 @@ PARTS: dict[str, tuple[str, Callable[[], None]]] = {
     "multigrid": ("multigrid.matrix", _multigrid),
     "refraction": ("spline.evaluate_net", _refraction),
     "surface": ("spline.pull_coefficients", _surface),
+    "fields": ("fields.pull_displacement", _fields),
     "image": ("random_points.scatter", _image),
     "adjoint": ("fused.backward", _adjoint),
 }

@@ -28,6 +28,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.waves.propagation import TURN, Exposure, ramp
 from caustic_cli.optics.waves.sampling import Sampling
 from caustic_cli.optics.waves.wavefront import LastSurface, PathChange
+from caustic_cli.scene import Lens
 
 _ONE = np.float32(1.0)
 # pi as a sum, whose first term has few enough digits for its multiples to be exact.
@@ -280,6 +281,18 @@ class FusedPathChange(PathChange):
     @staticmethod
     def _flat(c: np.ndarray) -> np.ndarray:
         return c.reshape(*c.shape[:-2], -1)
+
+
+def compile_kernels() -> None:
+    """Load all of them from the cache, or compile them, by calling them on the least of fields."""
+    surface, one = HeightField.of(Lens((2.0, 2.0), control=(4, 4))), torch.ones(1, 1)
+    sampling = Sampling((-1.0, -1.0), (2.0, 2.0), (1, 1), (2, 2), (0.0, 0.0), 100.0)
+    edges = torch.linspace(0.0, 2.0, 2, dtype=torch.float64)
+    light = FusedExposure(phase(one.double(), sampling, 5e-4, 5e-4), one, 1.0, (2, 2), (edges, edges))
+    paths = FusedPathChange(surface, LastSurface(one.double(), one.double(), one.double()), torch.float32)
+    out = torch.zeros(1, 1)
+    light.pull(light.image(paths.of(torch.zeros(4, 4, dtype=torch.float64))), one, out)
+    paths.pull(out)
 
 
 def phase(path: Tensor, sampling: Sampling, length: float, behind: float) -> Tensor:
