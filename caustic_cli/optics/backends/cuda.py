@@ -10,11 +10,13 @@ from torch import Tensor
 
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.interface import OutgoingRays
-from caustic_cli.optics.kernels.cuda import rays as by_ray
 from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.image import LitRays, expose
+from caustic_cli.optics.kernels.cuda.rays import on_device
 from caustic_cli.optics.kernels.cuda.splat import splat_rays
 from caustic_cli.optics.kernels.cuda.surface import hits_of_rays, surface_at, surface_of
+from caustic_cli.optics.kernels.interact import interact
+from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
@@ -66,12 +68,12 @@ class Cuda(Torch):
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
             )
         return OutgoingRays(
-            *by_ray.interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised)
+            *interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised, on=on_device)
         )
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """As the reference."""
-        return by_ray.land(origin, direction, point, axes, forward)
+        return land(origin, direction, point, axes, forward, on=on_device)
 
     def splat(self, x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor]:
         """As the reference."""

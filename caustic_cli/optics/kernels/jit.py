@@ -14,6 +14,7 @@ from typing import Any
 import numba
 from numba import prange
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
+from numba.core.dispatcher import Dispatcher
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.kernels import cache
@@ -71,6 +72,11 @@ class _Kept(FunctionCache):
 
     _impl_class = _Placed
 
+    def _index_key(self, sig, codegen):
+        """What distinguishes compiled codes of one source: of functions made in others, also the functions these are made of, by
+        their names.  Numba compares what they hold, which is never the same in another process."""
+        return sig, codegen.magic_tuple(), _made_of(self._py_func)
+
     def load_overload(self, sig, target_context):
         """The compiled code of a signature, None if there is none in the cache."""
         with contextlib.suppress(OSError, EOFError, pickle.PickleError):
@@ -84,6 +90,13 @@ class _Kept(FunctionCache):
             except (EOFError, pickle.PickleError):
                 self.flush()
                 super().save_overload(sig, data)
+
+
+def _made_of(function) -> tuple:
+    """Names of a function and, recursively, of those that it is made of; and other values."""
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    made = [_made_of(v.py_func) if isinstance(v, Dispatcher) else v for v in cells]
+    return function.__module__, function.__qualname__, *made
 
 
 def njit(*, entry: bool = False, parallel: bool = False, **options):

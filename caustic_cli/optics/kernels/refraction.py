@@ -23,12 +23,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from caustic_cli.optics.kernels.axial_refraction import EXACT, SCHLICK
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import BATCH, load, store
-from caustic_cli.optics.kernels.threads import ALL, on_threads
+from caustic_cli.optics.kernels.stage import Stage, load, store, store_flags
 from caustic_cli.optics.tolerances import CRITICAL, NORMAL
 
 # Rows of a batch's scratch: the ray, intermediate results, R and its derivatives, input and output derivatives.
@@ -118,10 +115,9 @@ def _prepare(v, count, surface):
 
 
 @njit(inline="always", **FAST)
-def refract_batch(v, start, count, ray, surface, t, after, passes):
-    """A batch of `refract`."""
+def bend(v, count, surface):
+    """t in BY_TX, BY_TY, BY_TZ and P' in BY_AFTER."""
     eta = surface.eta
-    _load(ray, start, count, v)
     _prepare(v, count, surface)
     for j in range(count):
         gamma = v[SIDE, j] * (1.0 - eta) * (1.0 + eta) / (v[S, j] + eta * v[C, j])
@@ -129,29 +125,17 @@ def refract_batch(v, start, count, ray, surface, t, after, passes):
         v[BY_TY, j] = eta * v[DY, j] - gamma * v[GY, j]
         v[BY_TZ, j] = eta * v[DZ, j] + gamma
         v[BY_AFTER, j] = v[P, j] * (1.0 - v[R, j]) if v[PASSES, j] > 0.0 else 0.0
-    for i in range(3):
-        store(v[BY_TX + i], start, count, t[i])
-    store(v[BY_AFTER], start, count, after)
-    batch = passes[start : start + count]
-    for j in range(count):
-        batch[j] = v[PASSES, j] > 0.0
 
 
-@njit(**FAST)
-def _refract_some(begin, end, ray, surface, t, after, passes):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        refract_batch(v, start, min(BATCH, end - start), ray, surface, t, after, passes)
-
-
-@njit(entry=True, **FAST)
-def refract(block, ray, surface, t, after, passes, blocks):
-    """Directions t, powers `after` and whether light passes (N,), from ray: d, g, P and E, nine components."""
-    if block == ALL:
-        on_threads(blocks, (ray, surface, t, after, passes, blocks))
-        return
-    count = len(after)
-    _refract_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, t, after, passes)
+@njit(inline="always", **FAST)
+def _refract(v, start, count, ray, surface, _given, out):
+    """t, P' and whether light passes, from d, g, P and E."""
+    results, passes = out
+    _load(ray, start, count, v)
+    bend(v, count, surface)
+    for i in range(4):
+        store(v[BY_TX + i], start, count, results[i])
+    store_flags(v[PASSES], start, count, passes)
 
 
 @njit(inline="always", **FAST)
@@ -206,8 +190,8 @@ def _pull_part(v, count):
 
 
 @njit(inline="always", **FAST)
-def pull_batch(v, start, count, ray, surface, given, out):
-    """A batch of `refract_adjoint`."""
+def _refract_adjoint(v, start, count, ray, surface, given, out):
+    """Derivatives by d, g, P and E, from those by t and P'."""
     _load(ray, start, count, v)
     for i in range(4):
         load(given[i], start, count, v[BY_TX + i])
@@ -219,17 +203,4 @@ def pull_batch(v, start, count, ray, surface, given, out):
         store(v[BY_DX + i], start, count, out[i])
 
 
-@njit(**FAST)
-def _pull_some(begin, end, ray, surface, given, out):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        pull_batch(v, start, min(BATCH, end - start), ray, surface, given, out)
-
-
-@njit(entry=True, **FAST)
-def refract_adjoint(block, ray, surface, given, out, count, blocks):
-    """Derivatives by the ray's components into `out`, from those by t and P', four components."""
-    if block == ALL:
-        on_threads(blocks, (ray, surface, given, out, count, blocks))
-        return
-    _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, given, out)
+REFRACT = Stage.of(_refract, _refract_adjoint, ROWS, 4)

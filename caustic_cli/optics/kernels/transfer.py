@@ -15,15 +15,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-import torch
-from torch import Tensor
-from torch.autograd.function import once_differentiable
-
-from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import BATCH, components, given, keep, kept, load, new, store, wanted
-from caustic_cli.optics.kernels.threads import ALL, on_threads
+from caustic_cli.optics.kernels.stage import Stage, here, load, store, store_flags
 from caustic_cli.optics.tolerances import PARALLEL
 
 OX, OY, OZ, DX, DY, DZ, K, OVER, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY, BY_DZ, ROWS = range(18)
@@ -49,23 +42,6 @@ class TargetPlane(NamedTuple):
     forward: float
 
 
-def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float):
-    """Intersections of rays with a plane.
-
-    Args:
-        origin, direction: by components, each a tensor (N,) float64 or a number for all rays, at least one of them a tensor.
-        point: of the plane, where its coordinates are 0.
-        axes: unit vectors along its x and y, and its normal.
-        forward: 1 for rays that arrive with d . normal > 0, -1 for those that arrive against it.
-
-    Returns:
-        x, y: (N,) in the plane; of rays that are not on their way to it those of their origin, and meaningless.
-        on_way: (N,) bool.
-    """
-    plane = TargetPlane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
-    return _Landing.apply(*origin, *direction, plane)
-
-
 @njit(inline="always", **FAST)
 def _path(ray, start, count, plane, v):
     """k, 1 / v, and 1 or 0 for whether the ray is on its way, into a batch's scratch."""
@@ -83,8 +59,9 @@ def _path(ray, start, count, plane, v):
 
 
 @njit(inline="always", **FAST)
-def land_batch(v, start, count, ray, plane, x, y, on_way):
-    """A batch of `_land`."""
+def _land(v, start, count, ray, plane, _given, out):
+    """x, y and whether the ray is on its way, from o and d."""
+    (x, y), on_way = out
     px, py, pz, ax, ay, az, bx, by, bz, _, _, _, _ = plane
     _path(ray, start, count, plane, v)
     for j in range(count):
@@ -93,31 +70,12 @@ def land_batch(v, start, count, ray, plane, x, y, on_way):
         v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
     store(v[X], start, count, x)
     store(v[Y], start, count, y)
-    batch = on_way[start : start + count]
-    for j in range(count):
-        batch[j] = v[ON_WAY, j] > 0.0
-
-
-@njit(**FAST)
-def _land_some(begin, end, ray, plane, x, y, on_way):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        land_batch(v, start, min(BATCH, end - start), ray, plane, x, y, on_way)
-
-
-@njit(entry=True, **FAST)
-def _land(block, ray, plane, x, y, on_way, blocks):
-    """x, y and on_way (N,), from ray: o and d, six components."""
-    if block == ALL:
-        on_threads(blocks, (ray, plane, x, y, on_way, blocks))
-        return
-    count = len(x)
-    _land_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, x, y, on_way)
+    store_flags(v[ON_WAY], start, count, on_way)
 
 
 @njit(inline="always", **FAST)
-def pull_batch(v, start, count, ray, plane, given, out):
-    """A batch of `_land_adjoint`."""
+def _land_adjoint(v, start, count, ray, plane, given, out):
+    """Derivatives by o and d, from those by x and y."""
     _, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _ = plane
     _path(ray, start, count, plane, v)
     load(given[0], start, count, v[X])
@@ -136,47 +94,22 @@ def pull_batch(v, start, count, ray, plane, given, out):
         store(v[BY_OX + i], start, count, out[i])
 
 
-@njit(**FAST)
-def _pull_some(begin, end, ray, plane, given, out):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        pull_batch(v, start, min(BATCH, end - start), ray, plane, given, out)
+LAND = Stage.of(_land, _land_adjoint, ROWS, 2)
 
 
-@njit(entry=True, **FAST)
-def _land_adjoint(block, ray, plane, given, out, count, blocks):
-    """Derivatives by the ray's components into `out`, from those by x and y."""
-    if block == ALL:
-        on_threads(blocks, (ray, plane, given, out, count, blocks))
-        return
-    _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, given, out)
+def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float, *, on=here):
+    """Intersections of rays with a plane.
 
+    Args:
+        origin, direction: by components, each a tensor (N,) float64 or a number for all rays, at least one of them a tensor.
+        point: of the plane, where its coordinates are 0.
+        axes: unit vectors along its x and y, and its normal.
+        forward: 1 for rays that arrive with d . normal > 0, -1 for those that arrive against it.
+        on: what makes the stage one of the rays' device.
 
-class _Landing(torch.autograd.Function):
-    """o and d by components, and the plane -> x, y and whether the ray is on its way."""
-
-    @staticmethod
-    def forward(ox, oy, oz, dx, dy, dz, plane: TargetPlane):
-        ray = (ox, oy, oz, dx, dy, dz)
-        count = _count(ray)
-        (x, y), on_way = new(2, count), np.empty(count, np.bool_)
-        _land(ALL, components(ray), plane, x, y, on_way, blocks())
-        return tuple(torch.from_numpy(a) for a in (x, y, on_way))
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        *ray, ctx.plane = inputs
-        ctx.count = _count(ray)
-        keep(ctx, ray)
-        ctx.mark_non_differentiable(output[2])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, by_x, by_y, _):
-        out = wanted(ctx, 6, ctx.count)
-        _land_adjoint(ALL, components(kept(ctx)), ctx.plane, components((by_x, by_y)), out, ctx.count, blocks())
-        return *given(ctx, out), None
-
-
-def _count(ray) -> int:
-    return next(len(c) for c in ray if isinstance(c, Tensor))
+    Returns:
+        x, y: (N,) in the plane; of rays that are not on their way to it those of their origin, and meaningless.
+        on_way: (N,) bool.
+    """
+    plane = TargetPlane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
+    return on(LAND)(plane, *origin, *direction)
