@@ -11,9 +11,8 @@ from torch import Tensor
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.interface import OutgoingRays
 from caustic_cli.optics.kernels.cuda import sums
-from caustic_cli.optics.kernels.cuda.image import LitRays, expose
+from caustic_cli.optics.kernels.cuda.image import LitRays, expose, splat_rays
 from caustic_cli.optics.kernels.cuda.rays import on_device
-from caustic_cli.optics.kernels.cuda.splat import splat_rays
 from caustic_cli.optics.kernels.cuda.surface import hits_of_rays, surface_at, surface_of
 from caustic_cli.optics.kernels.interact import interact
 from caustic_cli.optics.kernels.transfer import land

@@ -34,8 +34,6 @@ whatever method found t.  In reverse mode, for a loss L with derivatives L_t, L_
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from llvmlite import ir
 from numba import carray, types
@@ -43,7 +41,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from caustic_cli.optics.kernels.intersect import HIT, MISSED, _leaves, _root, _value
-from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.jit import FAST, SUMS, njit
 from caustic_cli.optics.kernels.spline import curvatures, piece, push_powers
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import FEW_ULP, LEAST_COSINE
@@ -59,8 +57,6 @@ FEWEST, CROWD = 64, 8
 ALONE = 64
 #: Largest numbers of moves to another span product, of steps with second-order terms, and of steps with all terms.
 TURNS, FIRST_STEPS, STEPS = 4, 2, 5
-#: Sums over a batch, whose order is left to the compiler.
-_SUMS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}}
 #: Margin around a span product, in its widths, within which its polynomial is evaluated; margin at the border in which `_root`
 #: decides.
 BEYOND, MARGIN = 0.02, 1e-12
@@ -499,7 +495,7 @@ def _tables(w, p, q, table):
             s[4 * LANES + k], s[5 * LANES + k] = power * eta, slope * eta + power
 
 
-@njit(**_SUMS)
+@njit(**SUMS)
 def _gather(table, p, q, total):
     """Add the sums over the lanes that `_tables` describes to total (p', q')."""
     pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4

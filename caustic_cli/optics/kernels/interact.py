@@ -9,7 +9,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from caustic_cli.optics.kernels import mirror, refraction
-from caustic_cli.optics.kernels.axial_refraction import FRESNEL
+from caustic_cli.optics.kernels.fresnel import FRESNEL
 from caustic_cli.optics.kernels.stage import here
 
 

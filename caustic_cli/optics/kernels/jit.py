@@ -19,10 +19,12 @@ from numba.core.dispatcher import Dispatcher
 from caustic_cli.errors import InputError
 from caustic_cli.optics.kernels import cache
 
-__all__ = ["FAST", "PARALLEL", "njit", "prange"]
+__all__ = ["FAST", "PARALLEL", "SUMS", "njit", "prange"]
 
 #: Sums of products may be contracted, and zeros lose their sign; no sum is reordered, no NaN or infinity assumed away.
 FAST: dict[str, Any] = {"fastmath": {"contract", "nsz"}}
+#: Sums over many numbers, whose order is left to the compiler.
+SUMS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}}
 #: Loops over `prange` run in parallel, and nothing else: every array that is filled would be a parallel loop of its own.
 PARALLEL = {
     "prange": True,

@@ -20,18 +20,18 @@ by_v is the derivative of whatever is differentiated by v.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
-from caustic_cli.optics.kernels.axial_refraction import EXACT, SCHLICK
+from caustic_cli.optics.kernels.fresnel import cosine_behind, reflectance
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.stage import Stage, load, store, store_flags
-from caustic_cli.optics.tolerances import CRITICAL, NORMAL
+from caustic_cli.optics.tolerances import NORMAL
 
-# Rows of a batch's scratch: the ray, intermediate results, R and its derivatives, input and output derivatives.
+# Rows of a batch's scratch: the ray, intermediate results, R and its derivatives; t and P', or in the adjoint derivatives by them;
+# and derivatives by f and by the ray.
 DX, DY, DZ, GX, GY, P, EX, EY, EZ = range(9)
 NORM2, C, SIDE, S, PASSES, F, R, R_C, R_S, R_NORM2, R_F = range(9, 20)
-BY_TX, BY_TY, BY_TZ, BY_AFTER, BY_F, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, BY_P, BY_EX, BY_EY, BY_EZ, ROWS = range(20, 35)
+TX, TY, TZ, AFTER, BY_F, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, BY_P, BY_EX, BY_EY, BY_EZ, ROWS = range(20, 35)
 
 
 class Interface(NamedTuple):
@@ -56,10 +56,9 @@ def _snell(v, count, eta):
         norm2 = 1.0 + gx * gx + gy * gy
         along = v[DZ, j] - v[DX, j] * gx - v[DY, j] * gy
         c = abs(along)
-        radicand = norm2 + (eta * eta) * (c * c - norm2)
-        passes = radicand > CRITICAL * norm2
-        v[NORM2, j], v[C, j], v[SIDE, j] = norm2, c, 1.0 if along >= 0.0 else -1.0
-        v[S, j], v[PASSES, j] = math.sqrt(radicand if passes else 1.0), 1.0 if passes else 0.0
+        s, passes = cosine_behind(norm2, c, eta)
+        v[NORM2, j], v[C, j], v[SIDE, j], v[S, j] = norm2, c, 1.0 if along >= 0.0 else -1.0, s
+        v[PASSES, j] = 1.0 if passes else 0.0
 
 
 @njit(inline="always", **FAST)
@@ -83,28 +82,9 @@ def _part(v, count, polarised):
 
 @njit(inline="always", **FAST)
 def _reflectance(v, count, eta, fresnel):
-    """R and its derivatives by c, s, |N|^2 and f."""
-    if fresnel == EXACT:
-        for j in range(count):
-            c, s, f = v[C, j], v[S, j], v[F, j]
-            us, up = 1.0 / (eta * c + s), 1.0 / (c + eta * s)
-            rs, rp = (eta * c - s) * us, (c - eta * s) * up
-            by_ratio = 4.0 * eta * (f * rs * us * us + (1.0 - f) * rp * up * up)
-            v[R, j], v[R_F, j] = f * rs * rs + (1.0 - f) * rp * rp, rs * rs - rp * rp
-            v[R_C, j], v[R_S, j], v[R_NORM2, j] = by_ratio * s, -by_ratio * c, 0.0
-    elif fresnel == SCHLICK:
-        r0, front = ((eta - 1.0) / (eta + 1.0)) ** 2, 0.0 if eta > 1.0 else 1.0
-        for j in range(count):
-            over = 1.0 / math.sqrt(v[NORM2, j])
-            k = (front * v[C, j] + (1.0 - front) * v[S, j]) * over
-            x = 1.0 - k
-            x4 = x * x * x * x
-            by_k = -5.0 * (1.0 - r0) * x4
-            v[R, j], v[R_F, j] = r0 + (1.0 - r0) * x4 * x, 0.0
-            v[R_C, j], v[R_S, j], v[R_NORM2, j] = front * by_k * over, (1.0 - front) * by_k * over, -0.5 * by_k * k * over * over
-    else:
-        for j in range(count):
-            v[R, j], v[R_C, j], v[R_S, j], v[R_NORM2, j], v[R_F, j] = 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(count):
+        r, by_c, by_s, by_norm2, by_f = reflectance(fresnel, eta, v[NORM2, j], v[C, j], v[S, j], v[F, j])
+        v[R, j], v[R_C, j], v[R_S, j], v[R_NORM2, j], v[R_F, j] = r, by_c, by_s, by_norm2, by_f
 
 
 @njit(inline="always", **FAST)
@@ -116,15 +96,15 @@ def _prepare(v, count, surface):
 
 @njit(inline="always", **FAST)
 def bend(v, count, surface):
-    """t in BY_TX, BY_TY, BY_TZ and P' in BY_AFTER."""
+    """t in TX, TY, TZ and P' in AFTER."""
     eta = surface.eta
     _prepare(v, count, surface)
     for j in range(count):
         gamma = v[SIDE, j] * (1.0 - eta) * (1.0 + eta) / (v[S, j] + eta * v[C, j])
-        v[BY_TX, j] = eta * v[DX, j] - gamma * v[GX, j]
-        v[BY_TY, j] = eta * v[DY, j] - gamma * v[GY, j]
-        v[BY_TZ, j] = eta * v[DZ, j] + gamma
-        v[BY_AFTER, j] = v[P, j] * (1.0 - v[R, j]) if v[PASSES, j] > 0.0 else 0.0
+        v[TX, j] = eta * v[DX, j] - gamma * v[GX, j]
+        v[TY, j] = eta * v[DY, j] - gamma * v[GY, j]
+        v[TZ, j] = eta * v[DZ, j] + gamma
+        v[AFTER, j] = v[P, j] * (1.0 - v[R, j]) if v[PASSES, j] > 0.0 else 0.0
 
 
 @njit(inline="always", **FAST)
@@ -134,16 +114,16 @@ def _refract(v, start, count, ray, surface, _given, out):
     _load(ray, start, count, v)
     bend(v, count, surface)
     for i in range(4):
-        store(v[BY_TX + i], start, count, results[i])
+        store(v[TX + i], start, count, results[i])
     store_flags(v[PASSES], start, count, passes)
 
 
 @njit(inline="always", **FAST)
-def _pull(v, count, eta):
+def pull(v, count, eta):
     """Adjoint but for f, whose derivative is left in BY_F."""
     for j in range(count):
         passes, side, c, s, gx, gy = v[PASSES, j], v[SIDE, j], v[C, j], v[S, j], v[GX, j], v[GY, j]
-        tx, ty, tz, by_after = v[BY_TX, j], v[BY_TY, j], v[BY_TZ, j], passes * v[BY_AFTER, j]
+        tx, ty, tz, by_after = v[TX, j], v[TY, j], v[TZ, j], passes * v[AFTER, j]
         # P'
         by_r = -v[P, j] * by_after
         v[BY_P, j] = (1.0 - v[R, j]) * by_after
@@ -194,9 +174,9 @@ def _refract_adjoint(v, start, count, ray, surface, given, out):
     """Derivatives by d, g, P and E, from those by t and P'."""
     _load(ray, start, count, v)
     for i in range(4):
-        load(given[i], start, count, v[BY_TX + i])
+        load(given[i], start, count, v[TX + i])
     _prepare(v, count, surface)
-    _pull(v, count, surface.eta)
+    pull(v, count, surface.eta)
     if surface.polarised:
         _pull_part(v, count)
     for i in range(9):

@@ -3,10 +3,10 @@
     forward, adjoint (v, start, count, ray, parameters, given, out)
 
 `forward` takes the rays' components `ray` and gives `out`, the results and whether each ray goes on; `adjoint` takes the
-derivatives `given` by the results, too, and gives those by the components.  A component of all rays is an array (N,), or (1,) if it is the same
-for all: both compile to the same kernel.  A derivative that is not requested is an array (0,).  `v` is a small scratch array that
-fits into the L1 cache, into whose rows a batch is copied: their strides are known at compile time, so the loops over them are
-vectorised without checks for overlap.  Everything is float64.
+derivatives `given` by the results, too, and gives those by the components.  A component of all rays is an array (N,), or (1,) if
+it is the same for all: both compile to the same kernel.  A derivative that is not requested is an array (0,).  `v` is a small
+scratch array that fits into the L1 cache, into whose rows a batch is copied: their strides are known at compile time, so the loops
+over them are vectorised without checks for overlap.  Everything is float64.
 """
 
 from __future__ import annotations
@@ -158,31 +158,3 @@ def component(value: Tensor | float | None) -> np.ndarray:
     if isinstance(value, Tensor):
         return value.detach().contiguous().numpy()
     return np.array([0.0 if value is None else value], np.float64)
-
-
-def components(values) -> tuple[np.ndarray, ...]:
-    """Several of them."""
-    return tuple(component(v) for v in values)
-
-
-def keep(ctx, values: tuple) -> None:
-    """Save components for the adjoint: tensors for torch's bookkeeping, numbers separately."""
-    tensors = [v if isinstance(v, Tensor) else None for v in values]
-    ctx.save_for_backward(*tensors)
-    ctx.numbers = [None if isinstance(v, Tensor) else v for v in values]
-    ctx.set_materialize_grads(False)
-
-
-def kept(ctx) -> tuple:
-    """The components saved by `keep`."""
-    return tuple(n if t is None else t for t, n in zip(ctx.saved_tensors, ctx.numbers, strict=True))
-
-
-def wanted(ctx, values: int, count: int) -> tuple[np.ndarray, ...]:
-    """Output arrays for the derivatives by the first `values` inputs, empty where not needed."""
-    return tuple(np.empty(count if need else 0) for need in ctx.needs_input_grad[:values])
-
-
-def given(ctx, arrays: tuple[np.ndarray, ...]) -> list[Tensor | None]:
-    """The requested derivatives, as tensors."""
-    return [torch.from_numpy(a) if need else None for a, need in zip(arrays, ctx.needs_input_grad, strict=False)]

@@ -43,10 +43,8 @@ class TargetPlane(NamedTuple):
 
 
 @njit(inline="always", **FAST)
-def _path(ray, start, count, plane, v):
-    """k, 1 / v, and 1 or 0 for whether the ray is on its way, into a batch's scratch."""
-    for i in range(6):
-        load(ray[i], start, count, v[i])
+def _path(v, count, plane):
+    """k, 1 / v, and 1 or 0 for whether the ray is on its way."""
     px, py, pz, nx, ny, nz, forward = plane.px, plane.py, plane.pz, plane.nx, plane.ny, plane.nz, plane.forward
     for j in range(count):
         speed = v[DX, j] * nx + v[DY, j] * ny + v[DZ, j] * nz
@@ -59,27 +57,21 @@ def _path(ray, start, count, plane, v):
 
 
 @njit(inline="always", **FAST)
-def _land(v, start, count, ray, plane, _given, out):
-    """x, y and whether the ray is on its way, from o and d."""
-    (x, y), on_way = out
+def reach_plane(v, count, plane):
+    """x and y in X, Y, from o and d."""
     px, py, pz, ax, ay, az, bx, by, bz, _, _, _, _ = plane
-    _path(ray, start, count, plane, v)
+    _path(v, count, plane)
     for j in range(count):
         k = v[K, j]
         rx, ry, rz = (v[OX, j] - px) + k * v[DX, j], (v[OY, j] - py) + k * v[DY, j], (v[OZ, j] - pz) + k * v[DZ, j]
         v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
-    store(v[X], start, count, x)
-    store(v[Y], start, count, y)
-    store_flags(v[ON_WAY], start, count, on_way)
 
 
 @njit(inline="always", **FAST)
-def _land_adjoint(v, start, count, ray, plane, given, out):
-    """Derivatives by o and d, from those by x and y."""
+def pull(v, count, plane):
+    """Adjoint of `reach_plane`, from the derivatives in X, Y."""
     _, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _ = plane
-    _path(ray, start, count, plane, v)
-    load(given[0], start, count, v[X])
-    load(given[1], start, count, v[Y])
+    _path(v, count, plane)
     for j in range(count):
         k, x, y = v[K, j], v[X, j], v[Y, j]
         # x and y
@@ -90,6 +82,28 @@ def _land_adjoint(v, start, count, ray, plane, given, out):
         by_away = by_k * v[OVER, j] if v[ON_WAY, j] > 0.0 else 0.0
         v[BY_OX, j], v[BY_OY, j], v[BY_OZ, j] = rx - by_away * nx, ry - by_away * ny, rz - by_away * nz
         v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = k * v[BY_OX, j], k * v[BY_OY, j], k * v[BY_OZ, j]
+
+
+@njit(inline="always", **FAST)
+def _land(v, start, count, ray, plane, _given, out):
+    """x, y and whether the ray is on its way, from o and d."""
+    (x, y), on_way = out
+    for i in range(6):
+        load(ray[i], start, count, v[i])
+    reach_plane(v, count, plane)
+    store(v[X], start, count, x)
+    store(v[Y], start, count, y)
+    store_flags(v[ON_WAY], start, count, on_way)
+
+
+@njit(inline="always", **FAST)
+def _land_adjoint(v, start, count, ray, plane, given, out):
+    """Derivatives by o and d, from those by x and y."""
+    for i in range(6):
+        load(ray[i], start, count, v[i])
+    load(given[0], start, count, v[X])
+    load(given[1], start, count, v[Y])
+    pull(v, count, plane)
     for i in range(6):
         store(v[BY_OX + i], start, count, out[i])
 
