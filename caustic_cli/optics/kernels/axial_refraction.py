@@ -10,29 +10,9 @@ Notation, a ray with slopes g = (z_x, z_y) at the exit surface, a = |g|^2, index
 
 from __future__ import annotations
 
+from caustic_cli.optics.kernels import rows as row
 from caustic_cli.optics.kernels.fresnel import cosine_behind, reflectance
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.rows import (
-    BESIDE,
-    BY_A,
-    BY_GX,
-    BY_GY,
-    BY_POWER,
-    BY_PX,
-    BY_PY,
-    BY_SAG,
-    FLUX,
-    GX,
-    GY,
-    POWER,
-    PX,
-    PY,
-    REACH,
-    REFLECTED_POWER,
-    SAG,
-    X,
-    Y,
-)
 
 
 @njit(inline="always", **FAST)
@@ -54,12 +34,12 @@ def _reflected(fresnel, a, n):
 
 @njit(**FAST)
 def _powers(fresnel, gx, gy, flux, n, out):
-    """Power of each ray behind the lens; REFLECTED_POWER where it is totally reflected."""
+    """Power of each ray behind the lens; row.REFLECTED_POWER where it is totally reflected."""
     for j in range(len(out)):
         a = gx[j] * gx[j] + gy[j] * gy[j]
         _, passes = cosine_behind(1.0 + a, 1.0, n)
         reflected, _ = _reflected(fresnel, a, n)
-        out[j] = flux[j] * (1.0 - reflected) if passes else REFLECTED_POWER
+        out[j] = flux[j] * (1.0 - reflected) if passes else row.REFLECTED_POWER
 
 
 @njit(**FAST)
@@ -82,18 +62,18 @@ def _landing(reach, slope, x, low, pixel, out):
 def _arrive(sag, height, out):
     """Put landing points beside the screen where the surface is beyond it."""
     for j in range(len(out)):
-        out[j] = out[j] if height > sag[j] else BESIDE
+        out[j] = out[j] if height > sag[j] else row.BESIDE
 
 
 @njit(inline="always", **FAST)
 def aim(v, exit_, frame):
     """Powers and landing points of a row of rays along z, from SAG, GX, GY, FLUX, X and Y."""
     n, height, fresnel = exit_.index, exit_.height, exit_.fresnel
-    _powers(fresnel, v[GX], v[GY], v[FLUX], n, v[POWER])
-    _reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
-    _landing(v[REACH], v[GX], v[X], frame.low_x, frame.pixel_x, v[PX])
-    _landing(v[REACH], v[GY], v[Y], frame.low_y, frame.pixel_y, v[PY])
-    _arrive(v[SAG], height, v[PX])
+    _powers(fresnel, v[row.GX], v[row.GY], v[row.FLUX], n, v[row.POWER])
+    _reach(v[row.SAG], v[row.GX], v[row.GY], n, height, v[row.REACH])
+    _landing(v[row.REACH], v[row.GX], v[row.X], frame.low_x, frame.pixel_x, v[row.PX])
+    _landing(v[row.REACH], v[row.GY], v[row.Y], frame.low_y, frame.pixel_y, v[row.PY])
+    _arrive(v[row.SAG], height, v[row.PX])
 
 
 @njit(**FAST)
@@ -125,7 +105,8 @@ def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
 def pull(vectors, exit_):
     """Adjoint: derivatives by sag and slopes, in BY_SAG, BY_GX, BY_GY, from those by power and pixel coordinates."""
     n, height, v = exit_.index, exit_.height, vectors
-    _by_a(exit_.fresnel, v[SAG], v[GX], v[GY], v[FLUX], v[BY_POWER], v[BY_PX], v[BY_PY], n, height, v[BY_A])
-    _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[BY_GX])
-    _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[BY_GY])
-    _by_sag(v[REACH], v[SAG], v[GX], v[GY], v[BY_PX], v[BY_PY], height, v[BY_SAG])
+    sag, gx, gy, flux, by_px, by_py = v[row.SAG], v[row.GX], v[row.GY], v[row.FLUX], v[row.BY_PX], v[row.BY_PY]
+    _by_a(exit_.fresnel, sag, gx, gy, flux, v[row.BY_POWER], by_px, by_py, n, height, v[row.BY_A])
+    _by_slope(v[row.REACH], gx, by_px, v[row.BY_A], v[row.BY_GX])
+    _by_slope(v[row.REACH], gy, by_py, v[row.BY_A], v[row.BY_GY])
+    _by_sag(v[row.REACH], sag, gx, gy, by_px, by_py, height, v[row.BY_SAG])

@@ -13,26 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 from caustic_cli.optics.kernels import axial_refraction, oblique_refraction
+from caustic_cli.optics.kernels import rows as row
 from caustic_cli.optics.kernels.arguments import Splat
 from caustic_cli.optics.kernels.jit import FAST, SUMS, njit
-from caustic_cli.optics.kernels.rows import (
-    BY_GX,
-    BY_GY,
-    BY_SAG,
-    FLUX,
-    GX,
-    GY,
-    MISSED_POWER,
-    POWER,
-    SAG,
-    SCRATCH,
-    VECTORS,
-    X,
-    Y,
-    combine,
-    load,
-    spread,
-)
+from caustic_cli.optics.kernels.rows import combine, load, spread
 from caustic_cli.optics.kernels.splat import gather, scatter, share
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
@@ -43,10 +27,10 @@ LOST_BY_FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # o
 def _aim(v, i, surface, rays, exit_, frame, oblique):
     """Powers and landing points of row i."""
     if oblique is None:
-        combine(i, surface, v[SAG], v[GX], v[GY])
-        load(rays.flux[i], v[FLUX])
-        load(rays.x[i], v[X])
-        load(rays.y[i], v[Y])
+        combine(i, surface, v[row.SAG], v[row.GX], v[row.GY])
+        load(rays.flux[i], v[row.FLUX])
+        load(rays.x[i], v[row.X])
+        load(rays.y[i], v[row.Y])
         axial_refraction.aim(v, exit_, frame)
     else:
         oblique_refraction.aim(v, i, surface, rays, exit_, frame)
@@ -55,15 +39,15 @@ def _aim(v, i, surface, rays, exit_, frame, oblique):
 @njit(**SUMS)
 def _account(v, ledger):
     """Add one row's losses at the surface, and the power that leaves it; that of lost rays becomes 0."""
-    flux, power = v[FLUX], v[POWER]
+    flux, power = v[row.FLUX], v[row.POWER]
     fresnel, reflected, missed, leaving = 0.0, 0.0, 0.0, 0.0
     for j in range(len(power)):
         emitted, weight = flux[j], power[j]
         lost = weight < 0.0
         fresnel += 0.0 if lost else emitted - weight
         leaving += 0.0 if lost else weight
-        reflected += emitted if lost and weight != MISSED_POWER else 0.0
-        missed += emitted if weight == MISSED_POWER else 0.0
+        reflected += emitted if lost and weight != row.MISSED_POWER else 0.0
+        missed += emitted if weight == row.MISSED_POWER else 0.0
         power[j] = 0.0 if lost else weight
     ledger[LOST_BY_FRESNEL] += fresnel
     ledger[REFLECTED] += reflected
@@ -79,13 +63,13 @@ def _remove_lost(power):
 
 def scratch_rows(splat: Splat) -> int:
     """Number of rows of a block's scratch memory."""
-    return VECTORS + SCRATCH + 2 * (splat.size_x + splat.size_y)
+    return row.VECTORS + row.SCRATCH + 2 * (splat.size_x + splat.size_y)
 
 
 @njit(inline="always", **FAST)
 def _cut(scratch, vx, vy):
     """A block's scratch as vectors, weights along x and y, their slopes."""
-    a = VECTORS + SCRATCH
+    a = row.VECTORS + row.SCRATCH
     b, c, d = a + vx, a + vx + vy, a + 2 * vx + vy
     return scratch[:a], scratch[a:b], scratch[b:c], scratch[c:d], scratch[d:]
 
@@ -136,11 +120,11 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, surface, rays, exi
     column, tilt = np.zeros(splat.size_y + -splat.size_y % 4), np.zeros(splat.size_y + -splat.size_y % 4)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
         _aim(v, i, surface, rays, exit_, frame, oblique)
-        _remove_lost(v[POWER])
+        _remove_lost(v[row.POWER])
         share(v, splat, sx, sy, dx, dy)
         gather(v, v.shape[1], frame, splat, sx, sy, dx, dy, grad, grad_leaving, grad_leaving, column, tilt)
         if oblique is None:
             axial_refraction.pull(v, exit_)
-            spread(i, surface, v[BY_SAG], v[BY_GX], v[BY_GY], nets[:, 0 if apart else block], apart)
+            spread(i, surface, v[row.BY_SAG], v[row.BY_GX], v[row.BY_GY], nets[:, 0 if apart else block], apart)
         else:
             oblique_refraction.pull(v, i, surface, rays, exit_, nets[:, 0])

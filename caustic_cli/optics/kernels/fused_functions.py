@@ -18,8 +18,9 @@ from caustic_cli.optics.kernels import blocks, fused, pixels, random_points
 from caustic_cli.optics.kernels.arguments import Exit, RowsOfRays, RowsOfSurface, ScreenFrame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.fresnel import FRESNEL
+from caustic_cli.optics.kernels.ray_intersections import RayIntersections
 from caustic_cli.optics.kernels.splat import trimmed
-from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, scattered_surface
+from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
 from caustic_cli.optics.kernels.threads import ALL
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
@@ -191,7 +192,7 @@ def compile_surface() -> None:
     heights = torch.zeros(4, 4, dtype=torch.float64, requires_grad=True)
     net, slope = AlongV(space, at, 0.5)(heights)
     found = scattered_surface(FusedSurface((space, space), (1.0, 1.0)), heights, at.numpy(), at.numpy())
-    sum(t.sum() for t in (net, slope, *found)).backward()
+    torch.stack([t.sum() for t in (net, slope, *found)]).sum().backward()
 
 
 def compile_splat() -> None:

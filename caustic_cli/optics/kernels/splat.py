@@ -25,25 +25,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
+from caustic_cli.optics.kernels import rows as row
 from caustic_cli.optics.kernels.arguments import ScreenFrame, Splat
 from caustic_cli.optics.kernels.filter_weights import pixel_weights
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits, total
-from caustic_cli.optics.kernels.rows import (
-    BY_POWER,
-    BY_PX,
-    BY_PY,
-    LEAN_X,
-    LEAN_Y,
-    OVER_X,
-    OVER_Y,
-    PHI,
-    POWER,
-    PX,
-    PY,
-    SCRATCH,
-    VECTORS,
-)
 from caustic_cli.optics.kernels.stage import load, store
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.reconstruction import Filter, padding
@@ -63,11 +49,11 @@ def _fraction(p, out):
 def share(v, splat, sx, sy, dx, dy):
     """Filter weights of one row's rays, and their derivatives unless dx and dy are empty."""
     if splat.size_x > 1:
-        _fraction(v[PX], v[PHI])
-    pixel_weights(splat.kind, splat.size_x, splat.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], v[VECTORS:])
+        _fraction(v[row.PX], v[row.PHI])
+    pixel_weights(splat.kind, splat.size_x, splat.alpha_x, v[row.PHI], sx, dx, v[row.OVER_X], v[row.LEAN_X], v[row.VECTORS :])
     if splat.size_y > 1:
-        _fraction(v[PY], v[PHI])
-    pixel_weights(splat.kind, splat.size_y, splat.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], v[VECTORS:])
+        _fraction(v[row.PY], v[row.PHI])
+    pixel_weights(splat.kind, splat.size_y, splat.alpha_y, v[row.PHI], sy, dy, v[row.OVER_Y], v[row.LEAN_Y], v[row.VECTORS :])
 
 
 @njit(**FAST)
@@ -76,7 +62,7 @@ def scatter(v, count, frame, splat, sx, sy, image, column):
     # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
     vx, vy = splat.size_x, splat.size_y
     rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
-    px, py, power, over_x, over_y = v[PX], v[PY], v[POWER], v[OVER_X], v[OVER_Y]
+    px, py, power, over_x, over_y = v[row.PX], v[row.PY], v[row.POWER], v[row.OVER_X], v[row.OVER_Y]
     outside = 0.0
     for j in range(count):
         x, y, weight = px[j], py[j], power[j]
@@ -123,8 +109,8 @@ def gather(v, count, frame, splat, sx, sy, dx, dy, grad, by_inside, by_outside, 
     """
     vx, vy, per_x, per_y = splat.size_x, splat.size_y, 1.0 / frame.pixel_x, 1.0 / frame.pixel_y
     rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
-    px, py, power, by_px, by_py, by_power = v[PX], v[PY], v[POWER], v[BY_PX], v[BY_PY], v[BY_POWER]
-    over_x, over_y, lean_x, lean_y = v[OVER_X], v[OVER_Y], v[LEAN_X], v[LEAN_Y]
+    px, py, power, by_px, by_py, by_power = v[row.PX], v[row.PY], v[row.POWER], v[row.BY_PX], v[row.BY_PY], v[row.BY_POWER]
+    over_x, over_y, lean_x, lean_y = v[row.OVER_X], v[row.OVER_Y], v[row.LEAN_X], v[row.LEAN_Y]
     for j in range(count):
         x, y = px[j], py[j]
         if not (x >= low_x and x < high_x and y >= low_y and y < high_y):
@@ -197,7 +183,7 @@ def trimmed(padded: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Ten
 @njit(**FAST)
 def _cut(splat):
     """A block's scratch: vectors, filter weights along x and y, their slopes; a column of each, in steps of four."""
-    v = np.zeros((VECTORS + SCRATCH, ROW))
+    v = np.zeros((row.VECTORS + row.SCRATCH, ROW))
     vx, vy = splat.size_x, splat.size_y
     long = vy + -vy % 4
     return v, np.empty((vx, ROW)), np.empty((vy, ROW)), np.empty((vx, ROW)), np.empty((vy, ROW)), np.zeros(long), np.zeros(long)
@@ -212,11 +198,11 @@ def _pixels(x, low, wide, count, out):
 @njit(**FAST)
 def aim(x, y, weight, start, count, frame, v):
     """Pixel coordinates and powers of one row of rays."""
-    load(x, start, count, v[PX])
-    load(y, start, count, v[PY])
-    load(weight, start, count, v[POWER])
-    _pixels(v[PX], frame.low_x, frame.pixel_x, count, v[PX])
-    _pixels(v[PY], frame.low_y, frame.pixel_y, count, v[PY])
+    load(x, start, count, v[row.PX])
+    load(y, start, count, v[row.PY])
+    load(weight, start, count, v[row.POWER])
+    _pixels(v[row.PX], frame.low_x, frame.pixel_x, count, v[row.PX])
+    _pixels(v[row.PY], frame.low_y, frame.pixel_y, count, v[row.PY])
 
 
 @njit(entry=True, **FAST)
@@ -248,9 +234,9 @@ def _splat_adjoint(block, x, y, weight, frame, splat, grad, by_outside, out, blo
         aim(x, y, weight, i * ROW, count, frame, v)
         share(v, splat, sx, sy, dx, dy)
         gather(v, count, frame, splat, sx, sy, dx, dy, grad, 0.0, by_outside, column, tilt)
-        store(v[BY_PX], i * ROW, count, out[0])
-        store(v[BY_PY], i * ROW, count, out[1])
-        store(v[BY_POWER], i * ROW, count, out[2])
+        store(v[row.BY_PX], i * ROW, count, out[0])
+        store(v[row.BY_PY], i * ROW, count, out[1])
+        store(v[row.BY_POWER], i * ROW, count, out[2])
 
 
 class _Splat(torch.autograd.Function):

@@ -19,7 +19,7 @@ from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.stage import Stage, here, load, store, store_flags
 from caustic_cli.optics.tolerances import PARALLEL
 
-OX, OY, OZ, DX, DY, DZ, K, OVER, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY, BY_DZ, ROWS = range(18)
+OX, OY, OZ, DX, DY, DZ, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY, BY_DZ, ROWS = range(16)
 
 Vector = tuple[float, float, float]
 
@@ -43,45 +43,38 @@ class TargetPlane(NamedTuple):
 
 
 @njit(inline="always", **FAST)
-def _path(v, count, plane):
-    """k, 1 / v, and 1 or 0 for whether the ray is on its way."""
-    px, py, pz, nx, ny, nz, forward = plane.px, plane.py, plane.pz, plane.nx, plane.ny, plane.nz, plane.forward
-    for j in range(count):
-        speed = v[DX, j] * nx + v[DY, j] * ny + v[DZ, j] * nz
-        away = (px - v[OX, j]) * nx + (py - v[OY, j]) * ny + (pz - v[OZ, j]) * nz
-        arrives = forward * speed > PARALLEL
-        over = 1.0 / (speed if arrives else 1.0)
-        k = away * over
-        on_way = arrives & (k > 0.0)
-        v[K, j], v[OVER, j], v[ON_WAY, j] = k if on_way else 0.0, over, 1.0 if on_way else 0.0
+def _path(ox, oy, oz, dx, dy, dz, plane):
+    """k, 1 / v, and whether the ray is on its way."""
+    nx, ny, nz = plane.nx, plane.ny, plane.nz
+    speed = dx * nx + dy * ny + dz * nz
+    away = (plane.px - ox) * nx + (plane.py - oy) * ny + (plane.pz - oz) * nz
+    arrives = plane.forward * speed > PARALLEL
+    over = 1.0 / (speed if arrives else 1.0)
+    k = away * over
+    on_way = arrives & (k > 0.0)
+    return k if on_way else 0.0, over, on_way
 
 
 @njit(inline="always", **FAST)
-def reach_plane(v, count, plane):
-    """x and y in X, Y, from o and d."""
-    px, py, pz, ax, ay, az, bx, by, bz, _, _, _, _ = plane
-    _path(v, count, plane)
-    for j in range(count):
-        k = v[K, j]
-        rx, ry, rz = (v[OX, j] - px) + k * v[DX, j], (v[OY, j] - py) + k * v[DY, j], (v[OZ, j] - pz) + k * v[DZ, j]
-        v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
+def arrive(ox, oy, oz, dx, dy, dz, plane):
+    """x and y of one ray, and whether it is on its way."""
+    k, _, on_way = _path(ox, oy, oz, dx, dy, dz, plane)
+    rx, ry, rz = (ox - plane.px) + k * dx, (oy - plane.py) + k * dy, (oz - plane.pz) + k * dz
+    return rx * plane.ax + ry * plane.ay + rz * plane.az, rx * plane.bx + ry * plane.by + rz * plane.bz, on_way
 
 
 @njit(inline="always", **FAST)
-def pull(v, count, plane):
-    """Adjoint of `reach_plane`, from the derivatives in X, Y."""
-    _, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _ = plane
-    _path(v, count, plane)
-    for j in range(count):
-        k, x, y = v[K, j], v[X, j], v[Y, j]
-        # x and y
-        rx, ry, rz = x * ax + y * bx, x * ay + y * by, x * az + y * bz
-        # r
-        by_k = rx * v[DX, j] + ry * v[DY, j] + rz * v[DZ, j]
-        # k
-        by_away = by_k * v[OVER, j] if v[ON_WAY, j] > 0.0 else 0.0
-        v[BY_OX, j], v[BY_OY, j], v[BY_OZ, j] = rx - by_away * nx, ry - by_away * ny, rz - by_away * nz
-        v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = k * v[BY_OX, j], k * v[BY_OY, j], k * v[BY_OZ, j]
+def pull(ox, oy, oz, dx, dy, dz, plane, x, y):
+    """Adjoint of `arrive`: derivatives by o and d, from those by x and y."""
+    k, over, on_way = _path(ox, oy, oz, dx, dy, dz, plane)
+    # x and y
+    rx, ry, rz = x * plane.ax + y * plane.bx, x * plane.ay + y * plane.by, x * plane.az + y * plane.bz
+    # r
+    by_k = rx * dx + ry * dy + rz * dz
+    # k
+    by_away = by_k * over if on_way else 0.0
+    by_ox, by_oy, by_oz = rx - by_away * plane.nx, ry - by_away * plane.ny, rz - by_away * plane.nz
+    return by_ox, by_oy, by_oz, k * by_ox, k * by_oy, k * by_oz
 
 
 @njit(inline="always", **FAST)
@@ -90,7 +83,9 @@ def _land(v, start, count, ray, plane, _given, out):
     (x, y), on_way = out
     for i in range(6):
         load(ray[i], start, count, v[i])
-    reach_plane(v, count, plane)
+    for j in range(count):
+        x_, y_, arrives = arrive(v[OX, j], v[OY, j], v[OZ, j], v[DX, j], v[DY, j], v[DZ, j], plane)
+        v[X, j], v[Y, j], v[ON_WAY, j] = x_, y_, 1.0 if arrives else 0.0
     store(v[X], start, count, x)
     store(v[Y], start, count, y)
     store_flags(v[ON_WAY], start, count, on_way)
@@ -103,7 +98,10 @@ def _land_adjoint(v, start, count, ray, plane, given, out):
         load(ray[i], start, count, v[i])
     load(given[0], start, count, v[X])
     load(given[1], start, count, v[Y])
-    pull(v, count, plane)
+    for j in range(count):
+        v[BY_OX, j], v[BY_OY, j], v[BY_OZ, j], v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = pull(
+            v[OX, j], v[OY, j], v[OZ, j], v[DX, j], v[DY, j], v[DZ, j], plane, v[X, j], v[Y, j]
+        )
     for i in range(6):
         store(v[BY_OX + i], start, count, out[i])
 

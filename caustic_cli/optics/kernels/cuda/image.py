@@ -20,33 +20,14 @@ from numba import cuda, float64, int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from caustic_cli.optics.kernels import axial_refraction, pixels, refraction, rows, splat
+from caustic_cli.optics.kernels import axial_refraction, pixels, splat
 from caustic_cli.optics.kernels import oblique_refraction as oblique
+from caustic_cli.optics.kernels import rows as row
 from caustic_cli.optics.kernels.arguments import Exit, ScreenFrame, Splat
 from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.launch import device, start
 from caustic_cli.optics.kernels.fresnel import FRESNEL
 from caustic_cli.optics.kernels.fused import COLUMNS, LEAVING, LOST_BY_FRESNEL, MISSED, OFF_SCREEN, REFLECTED
-from caustic_cli.optics.kernels.rows import (
-    BY_GX,
-    BY_GY,
-    BY_POWER,
-    BY_PX,
-    BY_PY,
-    BY_SAG,
-    FLUX,
-    GX,
-    GY,
-    MISSED_POWER,
-    OVER_X,
-    OVER_Y,
-    POWER,
-    PX,
-    PY,
-    SAG,
-    X,
-    Y,
-)
 from caustic_cli.optics.kernels.splat import trimmed
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
@@ -54,7 +35,7 @@ from caustic_cli.scene import Screen
 limits, share, gather, units = device(pixels.limits), device(splat.share), device(splat.gather), device(sums.units)
 aim_points, aim_axial, pull_axial = device(splat.aim), device(axial_refraction.aim), device(axial_refraction.pull)
 aim_batch, pull_batch = device(oblique.aim_batch), device(oblique.pull_batch)
-VECTORS = rows.VECTORS + rows.SCRATCH
+VECTORS, MISSED_POWER = row.VECTORS + row.SCRATCH, row.MISSED_POWER
 
 
 class Setting(NamedTuple):
@@ -68,61 +49,61 @@ class Setting(NamedTuple):
 
 
 # What comes before the splat, in three forms: from `given` and `rays` the power and landing point of ray k into the rows v, and
-# derivatives by `given` into `out`; with scratch rows w and u.
+# derivatives by `given` into `out`; with scratch rows w.
 
 
 @device
-def bend_axial(v, w, u, k, given, rays, exit_, frame):
+def bend_axial(v, w, k, given, rays, exit_, frame):
     """Rays along z; given: sag and slopes."""
     (sag, gx, gy), (x, y, _, _, power) = given, rays
-    v[SAG, 0], v[GX, 0], v[GY, 0], v[X, 0], v[Y, 0], v[FLUX, 0] = sag[k], gx[k], gy[k], x[k], y[k], power[k]
+    v[row.SAG, 0], v[row.GX, 0], v[row.GY, 0], v[row.X, 0], v[row.Y, 0], v[row.FLUX, 0] = sag[k], gx[k], gy[k], x[k], y[k], power[k]
     aim_axial(v, exit_, frame)
 
 
 @device
-def unbend_axial(v, w, u, k, exit_, out):
+def unbend_axial(v, w, k, exit_, out):
     """By sag and slopes."""
     pull_axial(v, exit_)
-    out[0][k], out[1][k], out[2][k] = v[BY_SAG, 0], v[BY_GX, 0], v[BY_GY, 0]
+    out[0][k], out[1][k], out[2][k] = v[row.BY_SAG, 0], v[row.BY_GX, 0], v[row.BY_GY, 0]
 
 
 @device
-def bend_oblique(v, w, u, k, given, rays, exit_, frame):
+def bend_oblique(v, w, k, given, rays, exit_, frame):
     """Rays of any direction; given: distances and slopes."""
     (t, gx, gy), (x, y, dx, dy, power) = given, rays
     w[oblique.REACH, 0], w[oblique.GX, 0], w[oblique.GY, 0] = t[k], gx[k], gy[k]
     w[oblique.DX, 0], w[oblique.DY, 0], w[oblique.P, 0] = dx[k], dy[k], power[k]
     w[oblique.X, 0], w[oblique.Y, 0] = x[k], y[k]
-    aim_batch(w, u, 1, exit_, frame)
-    v[POWER, 0], v[FLUX, 0] = w[oblique.POWER, 0], power[k]
-    v[PX, 0], v[PY, 0] = w[oblique.PX, 0], w[oblique.PY, 0]
+    aim_batch(w, 1, exit_, frame)
+    v[row.POWER, 0], v[row.FLUX, 0] = w[oblique.POWER, 0], power[k]
+    v[row.PX, 0], v[row.PY, 0] = w[oblique.PX, 0], w[oblique.PY, 0]
 
 
 @device
-def unbend_oblique(v, w, u, k, exit_, out):
+def unbend_oblique(v, w, k, exit_, out):
     """By distance and slopes."""
-    w[oblique.POWER, 0], w[oblique.PX, 0], w[oblique.PY, 0] = v[BY_POWER, 0], v[BY_PX, 0], v[BY_PY, 0]
-    pull_batch(w, u, 1, exit_)
-    out[0][k], out[1][k], out[2][k] = w[oblique.BY_REACH, 0], w[refraction.BY_GX, 0], w[refraction.BY_GY, 0]
+    w[oblique.POWER, 0], w[oblique.PX, 0], w[oblique.PY, 0] = v[row.BY_POWER, 0], v[row.BY_PX, 0], v[row.BY_PY, 0]
+    pull_batch(w, 1, exit_)
+    out[0][k], out[1][k], out[2][k] = w[oblique.BY_REACH, 0], w[oblique.BY_GX, 0], w[oblique.BY_GY, 0]
 
 
 @device
-def bend_points(v, w, u, k, given, rays, exit_, frame):
+def bend_points(v, w, k, given, rays, exit_, frame):
     """Rays of which landing points and powers are given."""
     aim_points(given[0], given[1], given[2], k, 1, frame, v)
 
 
 @device
-def unbend_points(v, w, u, k, exit_, out):
+def unbend_points(v, w, k, exit_, out):
     """By landing point and power."""
-    out[0][k], out[1][k], out[2][k] = v[BY_PX, 0], v[BY_PY, 0], v[BY_POWER, 0]
+    out[0][k], out[1][k], out[2][k] = v[row.BY_PX, 0], v[row.BY_PY, 0], v[row.BY_POWER, 0]
 
 
-#: By name, and rows w and u that they use.
+#: By name, and how many rows w they use.
 FORMS = {
-    "axial": (bend_axial, unbend_axial, 1, 1),
-    "oblique": (bend_oblique, unbend_oblique, oblique.ROWS, oblique.FLIGHT),
-    "points": (bend_points, unbend_points, 1, 1),
+    "axial": (bend_axial, unbend_axial, 1),
+    "oblique": (bend_oblique, unbend_oblique, oblique.ROWS),
+    "points": (bend_points, unbend_points, 1),
 }
 
 
@@ -130,7 +111,7 @@ FORMS = {
 def lands(v, frame, vx, vy):
     """Whether a ray reaches into the frame, and the first of its pixels; False for NaN too."""
     rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
-    x, y = v[PX, 0], v[PY, 0]
+    x, y = v[row.PX, 0], v[row.PY, 0]
     inside = x >= low_x and x < high_x and y >= low_y and y < high_y
     return (True, math.floor(x) + rx, math.floor(y) + ry) if inside else (False, 0, 0)
 
@@ -138,14 +119,13 @@ def lands(v, frame, vx, vy):
 @cache
 def _kernels(form: str, kind: int, vx: int, vy: int):
     """Forward and adjoint of a form, and a filter."""
-    bend, unbend, w_rows, u_rows = FORMS[form]
+    bend, unbend, w_rows = FORMS[form]
     bent, room = form != "points", vy + -vy % 4
 
     @cuda.jit
     def forward(given, rays, setting, place, unit, image, ledger):
         """Adds to `image` and `ledger`, both in units; place: start and height of an `Exit`."""
-        v = cuda.local.array((VECTORS, 1), float64)
-        w, u = cuda.local.array((w_rows, 1), float64), cuda.local.array((u_rows, 1), float64)
+        v, w = cuda.local.array((VECTORS, 1), float64), cuda.local.array((w_rows, 1), float64)
         sx, sy, none = cuda.local.array((vx, 1), float64), cuda.local.array((vy, 1), float64), cuda.local.array((1, 1), float64)
         own, block = cuda.local.array(COLUMNS, int64), cuda.shared.array(COLUMNS, int64)
         exit_, frame = Exit(setting.index, setting.fresnel, place[0], place[1]), setting.frame
@@ -156,10 +136,10 @@ def _kernels(form: str, kind: int, vx: int, vy: int):
             block[c] = 0
         cuda.syncthreads()
         for k in range(cuda.grid(1), len(given[0]), cuda.gridsize(1)):
-            bend(v, w, u, k, given, rays, exit_, frame)
-            weight = v[POWER, 0]
+            bend(v, w, k, given, rays, exit_, frame)
+            weight = v[row.POWER, 0]
             if bent:
-                emitted = v[FLUX, 0]
+                emitted = v[row.FLUX, 0]
                 if weight < 0.0:
                     own[MISSED if weight == MISSED_POWER else REFLECTED] += units(emitted, scale)
                     continue
@@ -170,7 +150,7 @@ def _kernels(form: str, kind: int, vx: int, vy: int):
                 own[OFF_SCREEN] += units(weight, scale)
                 continue
             share(v, splat, sx, sy, none[:0], none[:0])
-            weight *= v[OVER_X, 0] * v[OVER_Y, 0]
+            weight *= v[row.OVER_X, 0] * v[row.OVER_Y, 0]
             for a in range(vx):
                 for b in range(vy):
                     cuda.atomic.add(image, (i + a, j + b), units(weight * sx[a, 0] * sy[b, 0], scale))
@@ -183,8 +163,7 @@ def _kernels(form: str, kind: int, vx: int, vy: int):
     @cuda.jit
     def adjoint(given, rays, setting, place, grad, by_inside, by_outside, out):
         """Derivatives by `given` into `out`, from those by the padded image, and by the power of all rays inside and outside it."""
-        v = cuda.local.array((VECTORS, 1), float64)
-        w, u = cuda.local.array((w_rows, 1), float64), cuda.local.array((u_rows, 1), float64)
+        v, w = cuda.local.array((VECTORS, 1), float64), cuda.local.array((w_rows, 1), float64)
         sx, dx = cuda.local.array((vx, 1), float64), cuda.local.array((vx, 1), float64)
         sy, dy = cuda.local.array((vy, 1), float64), cuda.local.array((vy, 1), float64)
         column, tilt = cuda.local.array(room, float64), cuda.local.array(room, float64)
@@ -193,12 +172,12 @@ def _kernels(form: str, kind: int, vx: int, vy: int):
         for b in range(room):
             column[b], tilt[b] = 0.0, 0.0
         for k in range(cuda.grid(1), len(given[0]), cuda.gridsize(1)):
-            bend(v, w, u, k, given, rays, exit_, frame)
-            if bent and v[POWER, 0] < 0.0:
-                v[POWER, 0] = 0.0
+            bend(v, w, k, given, rays, exit_, frame)
+            if bent and v[row.POWER, 0] < 0.0:
+                v[row.POWER, 0] = 0.0
             share(v, splat, sx, sy, dx, dy)
             gather(v, 1, frame, splat, sx, sy, dx, dy, grad, by_inside[0], by_outside[0], column, tilt)
-            unbend(v, w, u, k, exit_, out)
+            unbend(v, w, k, exit_, out)
 
     return forward, adjoint
 
