@@ -16,7 +16,8 @@ from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.intersection import Method, Status
-from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections
+from caustic_cli.optics.kernels.ray_intersections import RayIntersections
+from caustic_cli.optics.kernels.surface import FusedSurface
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import Plane
 from caustic_cli.optics.surfaces.heightfield import HeightField

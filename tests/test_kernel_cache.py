@@ -13,16 +13,16 @@ import pytest
 
 from caustic_cli.optics.kernels import cache
 
-#: A kernel that is compiled in a second; what it gives follows from a constant of `tolerances`, by way of a function of `bend`.
+#: A kernel that is compiled in a second; what it gives follows from a constant of `tolerances`, by way of a function of `fresnel`.
 PROBE = '''"""A small kernel."""
 
-from caustic_cli.optics.kernels.axial_refraction import _s
+from caustic_cli.optics.kernels.fresnel import cosine_behind
 from caustic_cli.optics.kernels.jit import njit
 
 
 @njit(entry=True)
 def probe(a):
-    return 1.0 if _s(a, 1.5)[1] else 0.0
+    return 1.0 if cosine_behind(1.0 + a, 1.0, 1.5)[1] else 0.0
 '''
 RUN = """
 from caustic_cli.optics.kernels.probe import probe

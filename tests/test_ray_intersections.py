@@ -15,8 +15,8 @@ from caustic_cli.optics import intersection
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.intersection import Status
 from caustic_cli.optics.kernels import batches
-from caustic_cli.optics.kernels.ray_intersections import hits_of_rays
-from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections
+from caustic_cli.optics.kernels.ray_intersections import RayIntersections, hits_of_rays
+from caustic_cli.optics.kernels.surface import FusedSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 HALF = (5.0, 4.0)
@@ -123,13 +123,13 @@ def test_rays_are_put_in_order_of_their_span_products():
     field, fused, _ = surface()
     (x, y, _), _ = fan(1000, 0.1)
     order, used = batches.order(
-        (x * fused.scale[0] + 0.5).numpy(), (y * fused.scale[1] + 0.5).numpy(), fused.geometry[0], fused.geometry[3]
+        (x * fused.scale[0] + 0.5).numpy(), (y * fused.scale[1] + 0.5).numpy(), fused.pieces.breaks_u, fused.pieces.breaks_v
     )
     at = [
         torch.searchsorted(s.breaks[1:-1], c / (2 * r) + 0.5, right=True)
         for s, c, r in zip(field.spaces, (x, y), HALF, strict=True)
     ]
-    where = (at[0] * (len(fused.geometry[3]) - 1) + at[1])[torch.from_numpy(order).long()]
+    where = (at[0] * (len(fused.pieces.breaks_v) - 1) + at[1])[torch.from_numpy(order).long()]
     assert bool((where.diff() >= 0).all())
     assert len(where.unique()) == used
 

@@ -26,7 +26,8 @@ except ImportError:
     dr = mi = None
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections
+from caustic_cli.optics.kernels.ray_intersections import RayIntersections
+from caustic_cli.optics.kernels.surface import FusedSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 RAYS, ROUNDS, HALF = 2_000_000, 9, 5.0

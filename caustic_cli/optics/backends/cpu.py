@@ -22,10 +22,10 @@ from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
 from caustic_cli.optics.kernels.pencil import PencilKernel
 from caustic_cli.optics.kernels.polynomial_index import formula_flow
-from caustic_cli.optics.kernels.ray_intersections import hits_of_rays
+from caustic_cli.optics.kernels.ray_intersections import RayIntersections, hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
-from caustic_cli.optics.kernels.spline_index import VolumeAxis, volume_flow
-from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, next_intersections, scattered_surface
+from caustic_cli.optics.kernels.spline_index import volume_axis, volume_flow
+from caustic_cli.optics.kernels.surface import FusedSurface, next_intersections, scattered_surface
 from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.rays import RayState
@@ -94,12 +94,13 @@ class Numba(Torch):
         """As the reference; B-spline volumes and polynomial fields by kernels."""
         if time.numel() and field.formula is not None:
             terms, axial, squared = field.formula
-            out = formula_flow(terms, axial, squared, LEAST_SQUARE, (*point, *momentum), time, WEIGHTS[order], steps)
+            medium, terms = (axial, squared, LEAST_SQUARE), torch.tensor(terms, dtype=torch.float64)
+            out = formula_flow(terms, medium, (*point, *momentum), time, WEIGHTS[order], steps)
             return Flow(out[:3], out[3:6], out[6], out[7])
         if not isinstance(field, SplineIndex) or not time.numel():
             return super().flow(field, coefficients, point, momentum, time, steps, order)
         values = field.coefficients if coefficients is None else coefficients
-        out = volume_flow(_axes(field), values, (*point, *momentum), time, WEIGHTS[order], steps)
+        out = volume_flow(values, _axes(field), (*point, *momentum), time, WEIGHTS[order], steps)
         return Flow(out[:3], out[3:6], out[6], out[7])
 
     def find(
@@ -269,7 +270,6 @@ class RayImage:
 
 
 @lru_cache(maxsize=8)
-def _axes(field: SplineIndex) -> tuple[VolumeAxis, VolumeAxis, VolumeAxis]:
+def _axes(field: SplineIndex) -> tuple:
     """Kernel data of the axes of a B-spline volume."""
-    x, y, z = (VolumeAxis(s, *place) for s, place in zip(field.spaces, field.frame, strict=True))
-    return x, y, z
+    return tuple(volume_axis(s, *place) for s, place in zip(field.spaces, field.frame, strict=True))

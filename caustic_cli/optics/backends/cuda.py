@@ -10,11 +10,13 @@ from torch import Tensor
 
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.interface import OutgoingRays
-from caustic_cli.optics.kernels.cuda import rays as by_ray
 from caustic_cli.optics.kernels.cuda import sums
-from caustic_cli.optics.kernels.cuda.image import LitRays, expose
-from caustic_cli.optics.kernels.cuda.splat import splat_rays
-from caustic_cli.optics.kernels.cuda.surface import hits_of_rays, surface_at, surface_of
+from caustic_cli.optics.kernels.cuda.image import LitRays, expose, splat_rays
+from caustic_cli.optics.kernels.cuda.rays import on_device
+from caustic_cli.optics.kernels.cuda.surface import hits_of_rays, surface_of
+from caustic_cli.optics.kernels.interact import interact
+from caustic_cli.optics.kernels.surface import scattered_surface
+from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
@@ -34,14 +36,14 @@ class Cuda(Torch):
     def spline_on(self, field, sample: Sample, dtype: torch.dtype):
         """As the reference."""
         surface, u, v = surface_of(field, sample.u.device), *_points(sample)
-        return lambda sag: surface_at(surface, sag, u, v)
+        return lambda sag: scattered_surface(surface, sag, u, v)
 
     def spline_at(self, field, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As the reference."""
         if not len(x):
             return super().spline_at(field, heights, x, y)
         u, v = ((0.5 * (c.detach().double() / r + 1.0)).contiguous() for c, r in zip((x, y), field.half_size, strict=True))
-        return surface_at(surface_of(field, u.device), heights, u, v)
+        return scattered_surface(surface_of(field, u.device), heights, u, v)
 
     def intersect_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As the reference."""
@@ -66,12 +68,12 @@ class Cuda(Torch):
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
             )
         return OutgoingRays(
-            *by_ray.interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised)
+            *interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised, on=on_device)
         )
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """As the reference."""
-        return by_ray.land(origin, direction, point, axes, forward)
+        return land(origin, direction, point, axes, forward, on=on_device)
 
     def splat(self, x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor]:
         """As the reference."""
@@ -109,7 +111,7 @@ class CudaPlaneImage:
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
         """Image, power that leaves the surface, and what was lost there."""
         middle = heights.detach().double().mean()
-        sag = surface_at(self.surface, heights - middle, self.u, self.v)
+        sag = scattered_surface(self.surface, heights - middle, self.u, self.v)
         place = torch.stack([torch.zeros_like(middle), screen.z - middle])
         return expose(sag, self.light, self.unit, place, *self.interface, screen, filter)
 

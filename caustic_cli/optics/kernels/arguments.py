@@ -1,4 +1,4 @@
-"""Scalar arguments of the kernels in `fused`, as named tuples.
+"""Arguments of the kernels that come together, as named tuples.
 
 Numba compiles a kernel for each combination of argument types: integers are always `int` and other numbers `float`, so that there
 is only one.
@@ -8,11 +8,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
+from caustic_cli.optics.kernels.filter_weights import KINDS
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.scene import Screen
+
 
 class Exit(NamedTuple):
     """The exit surface and the screen behind it.
 
-    index: ratio of the indices in front of and behind it; fresnel: kind of Fresnel losses, as in `axial_refraction`; start: height
+    index: ratio of the indices in front of and behind it; fresnel: kind of Fresnel losses, as in `refraction`; start: height
     of the origins of oblique rays, height: of the screen, mm, both above the zero of the sag.
     """
 
@@ -32,6 +38,11 @@ class ScreenFrame(NamedTuple):
     pixel_x: float
     pixel_y: float
 
+    @classmethod
+    def of(cls, screen: Screen) -> ScreenFrame:
+        """Of a screen."""
+        return cls(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
+
 
 class Splat(NamedTuple):
     """The reconstruction filter: its kind, as in `filter_weights`, sizes in pixels (odd), and alpha, per pixel squared."""
@@ -41,3 +52,38 @@ class Splat(NamedTuple):
     size_y: int
     alpha_x: float
     alpha_y: float
+
+    @classmethod
+    def of(cls, filter: Filter) -> Splat:
+        """Of a filter."""
+        return cls(KINDS[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
+
+    def padded(self, frame: ScreenFrame) -> tuple[int, int]:
+        """Shape of an image padded by 2 r, with room for the scatter's last step of four pixels."""
+        return frame.pixels_x + 2 * (self.size_x - 1), frame.pixels_y + 2 * (self.size_y - 1) + -self.size_y % 4
+
+
+class RowsOfSurface(NamedTuple):
+    """The surface by rows: of row i the sag is sum_k bu[i, k] net[first[i] + k], dz/dx the same with du and net_x, dz/dy with bu
+    and net_y.
+
+    first (a,) int64; bu, du (a, p + 1); nets (n, b).  For oblique rays the nets are distances along them and slopes, (a, b),
+    whatever first, bu and du are.
+    """
+
+    first: np.ndarray
+    bu: np.ndarray
+    du: np.ndarray
+    net: np.ndarray
+    net_x: np.ndarray
+    net_y: np.ndarray
+
+
+class RowsOfRays(NamedTuple):
+    """Rays by rows, (a, b): origins, mm, transverse components of directions (of oblique rays), and parts of the source's power."""
+
+    x: np.ndarray
+    y: np.ndarray
+    along_x: np.ndarray
+    along_y: np.ndarray
+    flux: np.ndarray

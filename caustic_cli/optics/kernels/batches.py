@@ -34,7 +34,7 @@ whatever method found t.  In reverse mode, for a loss L with derivatives L_t, L_
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -42,9 +42,9 @@ from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from caustic_cli.optics.kernels.intersect import HIT, MISSED, _leaves, _root, _value
-from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.spline import curvatures, piece, push_powers
+from caustic_cli.optics.kernels.intersect import HIT, MISSED, _leaves, _root, value_at
+from caustic_cli.optics.kernels.jit import FAST, SUMS, njit
+from caustic_cli.optics.kernels.spline import curvatures, piece, place, push_powers
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import FEW_ULP, LEAST_COSINE
 
@@ -59,8 +59,6 @@ FEWEST, CROWD = 64, 8
 ALONE = 64
 #: Largest numbers of moves to another span product, of steps with second-order terms, and of steps with all terms.
 TURNS, FIRST_STEPS, STEPS = 4, 2, 5
-#: Sums over a batch, whose order is left to the compiler.
-_SUMS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}}
 #: Margin around a span product, in its widths, within which its polynomial is evaluated; margin at the border in which `_root`
 #: decides.
 BEYOND, MARGIN = 0.02, 1e-12
@@ -200,11 +198,13 @@ def _curvatures(w, c, i, j):
 
 
 @njit(**FAST)
-def _settle(w, size, c, i, j, bounds, ends_u, ends_v, mi, wi, mj, wj, scale_x, scale_y):
-    """Newton's iteration in all lanes, from T; DONE where it has converged in this span product, whose ends those are.
+def _settle(w, size, c, i, j, bounds, pieces):
+    """Newton's iteration in all lanes, from T; DONE where it has converged in this span product.
 
     bounds: of the span product, as of `_bounds`.  Returns in how many lanes it has not.
     """
+    bu, mu, wu, bv, mv, wv, scale_x, scale_y = pieces
+    mi, wi, mj, wj = mu[i], wu[i], mv[j], wv[j]
     p, q = c.shape[2], c.shape[3]
     xx, xy, yy = bounds[0] * wi * wi, bounds[1] * wi * wj, bounds[2] * wj * wj
     c0, c1, c2, c3 = c[i, j, 0, 0], c[i, j, 1, 0], c[i, j, 0, 1], c[i, j, 1, 1]
@@ -245,212 +245,205 @@ def _settle(w, size, c, i, j, bounds, ends_u, ends_v, mi, wi, mj, wj, scale_x, s
             left += 1 if busy and not done else 0
         if left == 0:
             break
-    left = 0
+    left, low_u, high_u, low_v, high_v = 0, bu[i], bu[i + 1], bv[j], bv[j + 1]
     for k in range(LANES):
         t = w[T + k]
         u, v = w[OU + k] + t * w[DU + k], w[OV + k] + t * w[DV + k]
-        within = (u >= ends_u[0]) & (u < ends_u[1]) & (v >= ends_v[0]) & (v < ends_v[1]) & (t > MARGIN * size)
+        within = (u >= low_u) & (u < high_u) & (v >= low_v) & (v < high_v) & (t > MARGIN * size)
         within &= (min(u, v) > MARGIN) & (max(u, v) < 1.0 - MARGIN) & (w[DONE + k] > 0.0)
         w[DONE + k] = 1.0 if within else 0.0
         left += 0 if within else 1
     return left
 
 
-def found(count: int) -> tuple[np.ndarray, ...]:
-    """Output arrays of `first_hits` for that many rays: status, reach, gx, gy, met, where."""
-    return (np.empty(count, np.int8), *(np.empty(count) for _ in range(3)), *(np.empty(count, np.int32) for _ in range(2)))
+class Hits(NamedTuple):
+    """First intersections of rays (N,): status, distances (-1 for none), dz/dx and dz/dy there.
+
+    met (N,): the rays in the order of processing; where (N,): their intersections' span products in row-major order, -1 for none.
+    """
+
+    status: np.ndarray
+    reach: np.ndarray
+    gx: np.ndarray
+    gy: np.ndarray
+    met: np.ndarray
+    where: np.ndarray
+
+    @classmethod
+    def of(cls, count: int) -> Hits:
+        """To be overwritten, of that many rays."""
+        return cls(np.empty(count, np.int8), *(np.empty(count) for _ in range(3)), *(np.empty(count, np.int32) for _ in range(2)))
 
 
 @njit(inline="always", **FAST)
-def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, bu, mu, wu, bv, mv, wv):
+def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, pieces):
     """Initial estimate of an intersection: with the plane in the middle of the hull, or if that is too rough, with planes below
     it."""
+    wu, wv = pieces.over_u, pieces.over_v
     t = max((middle - oz) / dz, 0.0)
-    i, j = piece(ou + t * du, bu), piece(ov + t * dv, bv)
+    i, j = piece(ou + t * du, pieces.breaks_u), piece(ov + t * dv, pieces.breaks_v)
     if thick * abs(du) * wu[i] < 0.1 * dz and thick * abs(dv) * wv[j] < 0.1 * dz:
         return t, i, j
     most = min(_leaves(ou, du), _leaves(ov, dv))
     for _ in range(2):
         t = min(max(t, 0.0), most)
-        i, j = piece(ou + t * du, bu), piece(ov + t * dv, bv)
-        xi, eta = (ou + t * du - mu[i]) * wu[i], (ov + t * dv - mv[j]) * wv[j]
+        i, j, xi, eta = place(ou + t * du, ov + t * dv, pieces)
         z = c[i, j, 0, 0] + c[i, j, 1, 0] * xi + c[i, j, 0, 1] * eta
         slope = dz - c[i, j, 1, 0] * wu[i] * du - c[i, j, 0, 1] * wv[j] * dv
         t -= (oz + t * dz - z) / max(slope, 0.5 * dz)
     t = min(max(t, 0.0), most)
-    return t, piece(ou + t * du, bu), piece(ov + t * dv, bv)
+    return t, piece(ou + t * du, pieces.breaks_u), piece(ov + t * dv, pieces.breaks_v)
 
 
 @njit(inline="always", **FAST)
-def first_hit(ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y):
+def first_hit(ray, limits, slopes, c, pieces):
     """First intersection of one ray, without a circular aperture: status, span product (-1: none), reach, dz/dx, dz/dy."""
     ou, ov, oz, du, dv, dz = ray
     slope = slopes[0] * abs(du) + slopes[1] * abs(dv)
-    t, status = _root((ou, ov, oz, du, dv, dz), -1.0, limits, slope, c, bu, mu, wu, bv, mv, wv)
+    t, status = _root((ou, ov, oz, du, dv, dz), -1.0, limits, slope, c, pieces)
     where, reach, gx, gy = -1, -1.0, 0.0, 0.0
     if status == HIT:
         u, v = ou + t * du, ov + t * dv
-        _, zu, zv = _value(c, u, v, bu, mu, wu, bv, mv, wv)
-        where, reach, gx, gy = piece(u, bu) * (len(bv) - 1) + piece(v, bv), t, zu * scale_x, zv * scale_y
+        _, zu, zv = value_at(c, u, v, pieces)
+        where = piece(u, pieces.breaks_u) * (len(pieces.breaks_v) - 1) + piece(v, pieces.breaks_v)
+        reach, gx, gy = t, zu * pieces.scale_x, zv * pieces.scale_y
     return status, where, reach, gx, gy
 
 
 @njit(inline="always", **FAST)
-def beyond(ou, ov, du, dv, reach, round_, scale_x, scale_y):
+def beyond(ou, ov, du, dv, reach, round_, pieces):
     """Whether an intersection is farther from the axis than `round_`, mm."""
-    x, y = (ou - 0.5 + reach * du) / scale_x, (ov - 0.5 + reach * dv) / scale_y
+    x, y = (ou - 0.5 + reach * du) / pieces.scale_x, (ov - 0.5 + reach * dv) / pieces.scale_y
     return x * x + y * y > round_ * round_
 
 
+class _Tile(NamedTuple):
+    """Of a tile's rays: estimates and numbers of those that are batched, their span products, who is left (and sorted by these),
+    and the numbers of those that go alone; lanes of a batch, and scratch of `_group`."""
+
+    start: np.ndarray
+    at: np.ndarray
+    key: np.ndarray
+    some: np.ndarray
+    together: np.ndarray
+    alone: np.ndarray
+    w: np.ndarray
+    ends: np.ndarray
+
+
+@njit(**FAST)
+def _sort_out(first, last, order, batched, rays, limits, slopes, c, pieces, tile):
+    """Which rays of a tile are batched, with estimates: how many are, how many are not, and the range of their span products."""
+    (ou, ov, oz, du, dv, dz), wide = rays, len(pieces.breaks_v) - 1
+    start, at, key, some, _, alone, _, _ = tile
+    middle, thick = 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
+    left, lone, low, high = 0, 0, np.int32(2**31 - 1), np.int32(0)
+    for k in range(first, last):
+        r = UINT(order[k])
+        u, v, safe = ou[r], ov[r], slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r]) < dz[r]
+        if not (batched and safe and u >= 0.0 and u <= 1.0 and v >= 0.0 and v <= 1.0):
+            alone[lone] = r
+            lone += 1
+            continue
+        t, i, j = _guess(u, v, oz[r], du[r], dv[r], dz[r], middle, thick, c, pieces)
+        start[left], at[left], some[left], key[left] = t, r, left, i * wide + j
+        low, high = min(low, key[left]), max(high, key[left])
+        left += 1
+    return left, lone, low, high
+
+
+@njit(**FAST)
+def _turn(left, lone, to, fewest, rays, size, c, pieces, tile, hits):
+    """One Newton iteration in batches: those that have converged into `hits`, from `to` on; the others are left, or go alone.
+
+    Returns left, lone, to, and the range of the span products of those left.
+    """
+    (ou, ov, oz, du, dv, dz), bu, bv = rays, pieces.breaks_u, pieces.breaks_v
+    status, reach, gx, gy, met, where = hits
+    start, at, key, some, together, alone, w, _ = tile
+    begin, stop, left, low, high, wide = 0, left, 0, np.int32(2**31 - 1), np.int32(0), len(bv) - 1
+    known, bounds = np.int32(-1), (0.0, 0.0, 0.0)
+    while begin < stop:
+        piece_ = key[together[begin]]
+        end, most = begin + 1, min(begin + LANES, stop)
+        while end < most and key[together[end]] == piece_:
+            end += 1
+        if end - begin < fewest:
+            for k in range(begin, end):
+                alone[lone] = at[together[k]]
+                lone += 1
+            begin = end
+            continue
+        a, b = piece_ // wide, piece_ % wide
+        if piece_ != known:
+            known, bounds = piece_, _bounds(c, a, b)
+        for k in range(LANES):
+            s = together[min(begin + k, end - 1)]
+            r = UINT(at[s])
+            w[OU + k], w[OV + k], w[OZ + k], w[T + k] = ou[r], ov[r], oz[r], start[s]
+            w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
+        _settle(w, size, c, a, b, bounds, pieces)
+        for k in range(end - begin):
+            s, t = together[begin + k], w[T + k]
+            r = UINT(at[s])
+            if w[DONE + k] > 0.0:
+                met[to], where[to] = r, piece_
+                status[r], reach[r], gx[r], gy[r] = HIT, t, w[G_U + k] * pieces.scale_x, w[G_V + k] * pieces.scale_y
+                to += 1
+                continue
+            start[s] = t
+            key[s] = piece(w[OU + k] + t * w[DU + k], bu) * wide + piece(w[OV + k] + t * w[DV + k], bv)
+            low, high = min(low, key[s]), max(high, key[s])
+            some[left] = s
+            left += 1
+        begin = end
+    return left, lone, to, low, high
+
+
+@njit(**FAST)
+def _one_by_one(lone, to, rays, limits, slopes, c, pieces, alone, hits):
+    ou, ov, oz, du, dv, dz = rays
+    for k in range(lone):
+        r = alone[k]
+        hits.met[to] = r
+        hits.status[r], hits.where[to], hits.reach[r], hits.gx[r], hits.gy[r] = first_hit(
+            (ou[r], ov[r], oz[r], du[r], dv[r], dz[r]), limits, slopes, c, pieces
+        )
+        to += 1
+
+
 @njit(entry=True, **FAST)
-def first_hits(
-    block,
-    order,
-    batched,
-    ou,
-    ov,
-    oz,
-    du,
-    dv,
-    dz,
-    limits,
-    slopes,
-    round_,
-    c,
-    bu,
-    mu,
-    wu,
-    bv,
-    mv,
-    wv,
-    scale_x,
-    scale_y,
-    status,
-    reach,
-    gx,
-    gy,
-    met,
-    where,
-    blocks,
-):
-    """First intersections of rays (N,): status, distances (-1 for none), dz/dx and dz/dy there into status, reach, gx, gy.
+def first_hits(block, order, batched, rays, limits, slopes, round_, c, pieces, hits, blocks):
+    """First intersections of rays, (o_u, o_v, o_z, d_u, d_v, d_z), (N,) each, into `hits`.
 
     order (N,): of the rays; batched: whether to look for batches; limits: least and largest control height; slopes: bounds of
-    |Z_u| and |Z_v|; round_: radius of a circular aperture, mm, or infinite.  met (N,): the rays in the order of processing; where
-    (N,): the span products of the intersections in row-major order, -1 for none.
+    |Z_u| and |Z_v|; round_: radius of a circular aperture, mm, or infinite.
     """
     if block == ALL:
-        on_threads(
-            blocks,
-            (
-                order,
-                batched,
-                ou,
-                ov,
-                oz,
-                du,
-                dv,
-                dz,
-                limits,
-                slopes,
-                round_,
-                c,
-                bu,
-                mu,
-                wu,
-                bv,
-                mv,
-                wv,
-                scale_x,
-                scale_y,
-                status,
-                reach,
-                gx,
-                gy,
-                met,
-                where,
-                blocks,
-            ),
-        )
+        on_threads(blocks, (order, batched, rays, limits, slopes, round_, c, pieces, hits, blocks))
         return
-    count, wide = len(ou), len(bv) - 1
-    size, middle, thick = max(abs(limits[0]), abs(limits[1])), 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
-    fewest = max(1, FEWEST // (c.shape[2] * c.shape[3]))
-    w, ends = np.empty(ROWS * LANES), np.empty(BOX + 2, np.int32)
-    start, at, key = np.empty(TILE), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
+    count, size, fewest = len(order), max(abs(limits[0]), abs(limits[1])), max(1, FEWEST // (c.shape[2] * c.shape[3]))
     some, together, alone = np.empty(TILE, np.int32), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
+    start, at, key = np.empty(TILE), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
+    tile = _Tile(start, at, key, some, together, alone, np.empty(ROWS * LANES), np.empty(BOX + 2, np.int32))
     first, stop = block * count // blocks, (block + 1) * count // blocks
-    to = first
     while first < stop:
-        last, left, lone, low, high = min(first + TILE, stop), 0, 0, np.int32(2**31 - 1), np.int32(0)
-        for k in range(first, last):
-            r = UINT(order[k])
-            u, v, safe = ou[r], ov[r], slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r]) < dz[r]
-            if not (batched and safe and u >= 0.0 and u <= 1.0 and v >= 0.0 and v <= 1.0):
-                alone[lone] = r
-                lone += 1
-                continue
-            t, i, j = _guess(u, v, oz[r], du[r], dv[r], dz[r], middle, thick, c, bu, mu, wu, bv, mv, wv)
-            start[left], at[left], some[left], key[left] = t, r, left, i * wide + j
-            low, high = min(low, key[left]), max(high, key[left])
-            left += 1
+        last, to = min(first + TILE, stop), first
+        left, lone, low, high = _sort_out(first, last, order, batched, rays, limits, slopes, c, pieces, tile)
         for _ in range(TURNS):
             if left < fewest or high - low >= BOX:
                 break
-            _group(some, left, key, low, high, ends, together)
-            begin, some_end, left, low, high = 0, left, 0, np.int32(2**31 - 1), np.int32(0)
-            known, bounds = np.int32(-1), (0.0, 0.0, 0.0)
-            while begin < some_end:
-                piece_ = key[together[begin]]
-                end, most = begin + 1, min(begin + LANES, some_end)
-                while end < most and key[together[end]] == piece_:
-                    end += 1
-                if end - begin < fewest:
-                    for k in range(begin, end):
-                        alone[lone] = at[together[k]]
-                        lone += 1
-                    begin = end
-                    continue
-                a, b = piece_ // wide, piece_ % wide
-                if piece_ != known:
-                    known, bounds = piece_, _bounds(c, a, b)
-                for k in range(LANES):
-                    s = together[min(begin + k, end - 1)]
-                    r = UINT(at[s])
-                    w[OU + k], w[OV + k], w[OZ + k], w[T + k] = ou[r], ov[r], oz[r], start[s]
-                    w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
-                _settle(
-                    w, size, c, a, b, bounds, (bu[a], bu[a + 1]), (bv[b], bv[b + 1]), mu[a], wu[a], mv[b], wv[b], scale_x, scale_y
-                )
-                for k in range(end - begin):
-                    s, t = together[begin + k], w[T + k]
-                    r = UINT(at[s])
-                    if w[DONE + k] > 0.0:
-                        met[to], where[to] = r, piece_
-                        status[r], reach[r], gx[r], gy[r] = HIT, t, w[G_U + k] * scale_x, w[G_V + k] * scale_y
-                        to += 1
-                        continue
-                    start[s] = t
-                    key[s] = piece(w[OU + k] + t * w[DU + k], bu) * wide + piece(w[OV + k] + t * w[DV + k], bv)
-                    low, high = min(low, key[s]), max(high, key[s])
-                    some[left] = s
-                    left += 1
-                begin = end
+            _group(some, left, key, low, high, tile.ends, together)
+            left, lone, to, low, high = _turn(left, lone, to, fewest, rays, size, c, pieces, tile, hits)
         for k in range(left):
             alone[lone] = at[some[k]]
             lone += 1
-        for k in range(lone):
-            r = alone[k]
-            ray = (ou[r], ov[r], oz[r], du[r], dv[r], dz[r])
-            met[to] = r
-            status[r], where[to], reach[r], gx[r], gy[r] = first_hit(
-                ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y
-            )
-            to += 1
+        _one_by_one(lone, to, rays, limits, slopes, c, pieces, alone, hits)
         if round_ < np.inf:  # outside a circular aperture the ray has left the lens
+            (ou, ov, _, du, dv, _), (status, reach, gx, gy, met, where) = rays, hits
             for k in range(first, last):
                 r = met[k]
-                if status[r] == HIT and beyond(ou[r], ov[r], du[r], dv[r], reach[r], round_, scale_x, scale_y):
+                if status[r] == HIT and beyond(ou[r], ov[r], du[r], dv[r], reach[r], round_, pieces):
                     where[k], status[r], reach[r], gx[r], gy[r] = -1, MISSED, -1.0, 0.0, 0.0
         first = last
 
@@ -499,7 +492,7 @@ def _tables(w, p, q, table):
             s[4 * LANES + k], s[5 * LANES + k] = power * eta, slope * eta + power
 
 
-@njit(**_SUMS)
+@njit(**SUMS)
 def _gather(table, p, q, total):
     """Add the sums over the lanes that `_tables` describes to total (p', q')."""
     pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
@@ -535,85 +528,78 @@ def _gather(table, p, q, total):
 
 
 @njit(inline="always", **FAST)
-def pull_alone(c, i, j, xi, eta, wi, wj, by_t, by_u, by_v, direction, gx, gy, scale_x, scale_y):
+def pull_alone(c, i, j, xi, eta, by_t, by_u, by_v, direction, gx, gy, pieces):
     """X, Y and L_Z of one ray in (u, v, z)-space; by_u, by_v: derivatives by Z_u and Z_v."""
-    du, dv, dz = direction
+    (du, dv, dz), wi, wj = direction, pieces.over_u[i], pieces.over_v[j]
     xx, xy, yy = curvatures(c, i, j, xi, eta)
     xx, xy, yy = xx * wi * wi, xy * wi * wj, yy * wj * wj
     by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
-    cosine = max(dz - gx * du / scale_x - gy * dv / scale_y, LEAST_COSINE)
+    cosine = max(dz - gx * du / pieces.scale_x - gy * dv / pieces.scale_y, LEAST_COSINE)
     return by_x, by_y, (by_t + by_x * du + by_y * dv) / cosine
 
 
+@njit(**FAST)
+def _pull_each(begin, end, a, b, met, by, rays, found, c, pieces, grad, powers, starts):
+    """The adjoint of some rays that meet the span product (a, b), one by one."""
+    (by_t, by_gx, by_gy), (ou, ov, _, du, dv, dz), (t, gx, gy), (by_ox, by_oy, by_oz) = by, rays, found, starts
+    wi, wj, mi, mj, scale_x, scale_y = (
+        pieces.over_u[a],
+        pieces.over_v[b],
+        pieces.middle_u[a],
+        pieces.middle_v[b],
+        pieces.scale_x,
+        pieces.scale_y,
+    )
+    for k in range(begin, end):
+        r = met[k]
+        xi, eta = (ou[r] + t[r] * du[r] - mi) * wi, (ov[r] + t[r] * dv[r] - mj) * wj
+        by_u, by_v = by_gx[r] * scale_x, by_gy[r] * scale_y
+        by_x, by_y, by_z = pull_alone(c, a, b, xi, eta, by_t[r], by_u, by_v, (du[r], dv[r], dz[r]), gx[r], gy[r], pieces)
+        if grad.size > 0:
+            push_powers(grad, a, b, xi, eta, by_z, by_u * wi, by_v * wj, powers)
+        if len(by_ox) > 0:
+            by_ox[r], by_oy[r], by_oz[r] = by_x * scale_x + by_z * gx[r], by_y * scale_y + by_z * gy[r], -by_z
+
+
+@njit(**FAST)
+def _pull_lanes(begin, end, a, b, met, by, rays, found, c, pieces, w, starts):
+    """The same of rays in lanes: X, Y and L_Z, and by these the rays' starts; the rest is left to `_tables`."""
+    (by_t, by_gx, by_gy), (ou, ov, _, du, dv, dz), (t, gx, gy), (by_ox, by_oy, by_oz) = by, rays, found, starts
+    _, mu, wu, _, mv, wv, scale_x, scale_y = pieces
+    wi, wj, mi, mj = wu[a], wv[b], mu[a], mv[b]
+    for k in range(LANES):
+        r, here = UINT(met[min(begin + k, end - 1)]), 1.0 if k < end - begin else 0.0
+        w[OU + k], w[OV + k], w[T + k], w[GX + k], w[GY + k] = ou[r], ov[r], t[r], gx[r], gy[r]
+        w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
+        w[BY_T + k], w[BY_U + k], w[BY_V + k] = here * by_t[r], here * by_gx[r], here * by_gy[r]
+    for k in range(LANES):
+        w[XI + k] = (w[OU + k] + w[T + k] * w[DU + k] - mi) * wi
+        w[ETA + k] = (w[OV + k] + w[T + k] * w[DV + k] - mj) * wj
+    _curvatures(w, c, a, b)
+    for k in range(LANES):
+        xx, xy, yy = 2.0 * w[H_XI + k] * wi * wi, w[MIXED + k] * wi * wj, 2.0 * w[H_ETA + k] * wj * wj
+        by_u, by_v = w[BY_U + k] * scale_x, w[BY_V + k] * scale_y
+        by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
+        cosine = max(w[DZ + k] - w[GX + k] / scale_x * w[DU + k] - w[GY + k] / scale_y * w[DV + k], LEAST_COSINE)
+        by_z = (w[BY_T + k] + by_x * w[DU + k] + by_y * w[DV + k]) / cosine
+        w[BY_Z + k], w[BY_U + k], w[BY_V + k] = by_z, by_u * wi, by_v * wj
+        w[BY_X + k], w[BY_Y + k] = by_x * scale_x + by_z * w[GX + k], by_y * scale_y + by_z * w[GY + k]
+    if len(by_ox) > 0:
+        for k in range(end - begin):
+            r = met[begin + k]
+            by_ox[r], by_oy[r], by_oz[r] = w[BY_X + k], w[BY_Y + k], -w[BY_Z + k]
+
+
 @njit(entry=True, **FAST)
-def pull_back(
-    block,
-    met,
-    where,
-    by_t,
-    by_gx,
-    by_gy,
-    ou,
-    ov,
-    du,
-    dv,
-    dz,
-    t,
-    gx,
-    gy,
-    c,
-    bu,
-    mu,
-    wu,
-    bv,
-    mv,
-    wv,
-    scale_x,
-    scale_y,
-    grads,
-    by_ox,
-    by_oy,
-    by_oz,
-):
+def pull_back(block, met, where, by, rays, found, c, pieces, grads, starts):
     """Adjoint of `first_hits`: derivatives by the coefficients (blocks, I, J, p + 1, q + 1), overwritten, and by the rays' starts.
 
-    by_*: derivatives by distance and slopes (N,); met, where, t, gx, gy: from `first_hits`, t its reach; grads may have no
-    coefficients, and by_ox, by_oy, by_oz (N,), per mm, no rays, if these are not asked for.
+    by: derivatives by distance and slopes, (N,) each; met, where: from `first_hits`; found: distance and slopes; grads may have no
+    coefficients, and `starts` (by o, (N,) each, per mm) no rays, if these are not asked for.
     """
-    count, blocks, p, q, wide = len(t), len(grads), c.shape[2], c.shape[3], len(bv) - 1
-    nets, starts = grads.shape[1] > 0, len(by_ox) > 0
+    count, blocks, p, q, wide = len(where), len(grads), c.shape[2], c.shape[3], len(pieces.breaks_v) - 1
     if block == ALL:
-        on_threads(
-            blocks,
-            (
-                met,
-                where,
-                by_t,
-                by_gx,
-                by_gy,
-                ou,
-                ov,
-                du,
-                dv,
-                dz,
-                t,
-                gx,
-                gy,
-                c,
-                bu,
-                mu,
-                wu,
-                bv,
-                mv,
-                wv,
-                scale_x,
-                scale_y,
-                grads,
-                by_ox,
-                by_oy,
-                by_oz,
-            ),
-        )
+        on_threads(blocks, (met, where, by, rays, found, c, pieces, grads, starts))
         return
     w, grad, powers = np.zeros(ROWS * LANES), grads[block], np.empty((2, q))
     grad[:] = 0.0
@@ -623,50 +609,19 @@ def pull_back(
     summed = False
     while begin < stop:
         if where[begin] < 0:
-            if starts:
-                by_ox[met[begin]], by_oy[met[begin]], by_oz[met[begin]] = 0.0, 0.0, 0.0
+            if len(starts[0]) > 0:
+                starts[0][met[begin]], starts[1][met[begin]], starts[2][met[begin]] = 0.0, 0.0, 0.0
             begin += 1
             continue
         end, most, a, b = begin + 1, min(begin + LANES, stop), where[begin] // wide, where[begin] % wide
         while end < most and where[end] == where[begin]:
             end += 1
-        wi, wj, mi, mj = wu[a], wv[b], mu[a], mv[b]
         if not summed and (end - begin) * (p + q) < ALONE:
-            for k in range(begin, end):
-                r = met[k]
-                xi, eta = (ou[r] + t[r] * du[r] - mi) * wi, (ov[r] + t[r] * dv[r] - mj) * wj
-                by_u, by_v = by_gx[r] * scale_x, by_gy[r] * scale_y
-                by_x, by_y, by_z = pull_alone(
-                    c, a, b, xi, eta, wi, wj, by_t[r], by_u, by_v, (du[r], dv[r], dz[r]), gx[r], gy[r], scale_x, scale_y
-                )
-                if nets:
-                    push_powers(grad, a, b, xi, eta, by_z, by_u * wi, by_v * wj, powers)
-                if starts:
-                    by_ox[r], by_oy[r], by_oz[r] = by_x * scale_x + by_z * gx[r], by_y * scale_y + by_z * gy[r], -by_z
+            _pull_each(begin, end, a, b, met, by, rays, found, c, pieces, grad, powers, starts)
             begin = end
             continue
-        for k in range(LANES):
-            r, here = UINT(met[min(begin + k, end - 1)]), 1.0 if k < end - begin else 0.0
-            w[OU + k], w[OV + k], w[T + k], w[GX + k], w[GY + k] = ou[r], ov[r], t[r], gx[r], gy[r]
-            w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
-            w[BY_T + k], w[BY_U + k], w[BY_V + k] = here * by_t[r], here * by_gx[r], here * by_gy[r]
-        for k in range(LANES):
-            w[XI + k] = (w[OU + k] + w[T + k] * w[DU + k] - mi) * wi
-            w[ETA + k] = (w[OV + k] + w[T + k] * w[DV + k] - mj) * wj
-        _curvatures(w, c, a, b)
-        for k in range(LANES):
-            xx, xy, yy = 2.0 * w[H_XI + k] * wi * wi, w[MIXED + k] * wi * wj, 2.0 * w[H_ETA + k] * wj * wj
-            by_u, by_v = w[BY_U + k] * scale_x, w[BY_V + k] * scale_y
-            by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
-            cosine = max(w[DZ + k] - w[GX + k] / scale_x * w[DU + k] - w[GY + k] / scale_y * w[DV + k], LEAST_COSINE)
-            by_z = (w[BY_T + k] + by_x * w[DU + k] + by_y * w[DV + k]) / cosine
-            w[BY_Z + k], w[BY_U + k], w[BY_V + k] = by_z, by_u * wi, by_v * wj
-            w[BY_X + k], w[BY_Y + k] = by_x * scale_x + by_z * w[GX + k], by_y * scale_y + by_z * w[GY + k]
-        if starts:
-            for k in range(end - begin):
-                r = met[begin + k]
-                by_ox[r], by_oy[r], by_oz[r] = w[BY_X + k], w[BY_Y + k], -w[BY_Z + k]
-        if nets:
+        _pull_lanes(begin, end, a, b, met, by, rays, found, c, pieces, w, starts)
+        if grad.size > 0:
             _tables(w, p, q, table)
             _gather(table, p, q, total)
             summed = end < stop and where[end] == where[begin]

@@ -14,12 +14,15 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import axial_refraction, blocks, filter_weights, fused, pixels, random_points
-from caustic_cli.optics.kernels.arguments import Exit, ScreenFrame, Splat
+from caustic_cli.optics.kernels import blocks, fused, pixels, random_points
+from caustic_cli.optics.kernels.arguments import Exit, RowsOfRays, RowsOfSurface, ScreenFrame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
-from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, scattered_surface
+from caustic_cli.optics.kernels.fresnel import FRESNEL
+from caustic_cli.optics.kernels.ray_intersections import RayIntersections
+from caustic_cli.optics.kernels.splat import trimmed
+from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
 from caustic_cli.optics.kernels.threads import ALL
-from caustic_cli.optics.reconstruction import Filter, padding
+from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
 
 
@@ -76,7 +79,8 @@ class PlaneKernel:
             x, y, power = u.view(shape), v.view(shape), power.view(shape) if power.ndim else power
         self.shape = shape
         coordinates = ((2.0 * x - 1.0) * rx, (2.0 * y - 1.0) * ry, power)
-        self.rays = tuple(_strided(np.broadcast_to(t.double().numpy(), shape)) for t in coordinates)
+        own_x, own_y, flux = (_strided(np.broadcast_to(t.double().numpy(), shape)) for t in coordinates)
+        self.rays = RowsOfRays(own_x, own_y, _NONE, _NONE, flux)
         self.rows = (self.first.numpy(), self.bu.numpy(), self.du.numpy())
 
     def __call__(self, sag: Tensor, eta: float, fresnel: str, height: float, screen: Screen, filter: Filter):
@@ -87,9 +91,7 @@ class PlaneKernel:
             nets = (net, net, net_y)
         else:
             nets = [t.view(self.shape) for t in scattered_surface(self.surface, sag, *self.points)]
-        x, y, power = self.rays
-        rays = (x, y, _NONE, _NONE, power)
-        return _splat(nets, self.rows, not self.tensor, rays, (eta, fresnel), height, 0.0, screen, filter, self.workspace)
+        return _splat(nets, self.rows, not self.tensor, self.rays, (eta, fresnel), (0.0, height), screen, filter, self.workspace)
 
 
 class RayKernel:
@@ -115,72 +117,47 @@ class RayKernel:
         power = power.double()[order]
         power[count:] = 0.0
         self.hits, self.z = RayIntersections(self.surface, (x, y, origin[2]), direction, radius), origin[2]
-        self.rays = tuple(_strided(t.view(self.shape).numpy()) for t in (x, y, *direction[:2], power))
+        self.rays = RowsOfRays(*(_strided(t.view(self.shape).numpy()) for t in (x, y, *direction[:2], power)))
         ones = np.ones((self.shape[0], 1))
         self.rows = (np.arange(self.shape[0]), ones, ones)
 
     def __call__(self, heights: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
         """Control heights (n, m) mm float64; `reference` is where the screen's height is counted from, mm: see `_splat`."""
         nets = [t.view(self.shape) for t in self.hits(heights)]
-        return _splat(
-            nets,
-            self.rows,
-            True,
-            self.rays,
-            (eta, fresnel),
-            screen.z - reference,
-            self.z - reference,
-            screen,
-            filter,
-            self.workspace,
-        )
+        heights_of = self.z - reference, screen.z - reference
+        return _splat(nets, self.rows, True, self.rays, (eta, fresnel), heights_of, screen, filter, self.workspace)
 
 
 def _splat(
     nets,
     rows,
     apart: bool,
-    rays,
+    rays: RowsOfRays,
     interface: tuple[float, str],
-    height: float,
-    start: float,
+    ends: tuple[float, float],
     screen: Screen,
     filter: Filter,
     workspace: _Workspace,
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; start: height at which oblique rays begin, mm.
+    """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; ends: heights of oblique rays' origins
+    and of the screen, mm.
 
     Returns:
         image (n_x, n_y) and the power behind the lens (), float64, differentiable; losses by name.
     """
-    oblique, arguments = _arguments(rays, interface, height, start, screen, filter)
+    arguments = _arguments(rays, interface, ends, screen, filter)
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
-    (nx, ny), (rx, ry) = screen.resolution, filter.reach
-    padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
-    image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
-    lost = {"missed_surface": ledger[fused.MISSED]} if oblique else {}
-    return (
-        image,
-        leaving,
-        lost
-        | {
-            "fresnel": ledger[fused.FRESNEL],
-            "total_internal_reflection": ledger[fused.REFLECTED],
-            "off_screen": ledger[fused.OFF_SCREEN] + padding(padded.detach(), filter.reach),
-        },
-    )
+    image, beside = trimmed(padded, screen, filter)
+    lost = {"missed_surface": ledger[fused.MISSED]} if rays.along_x is not _NONE else {}
+    lost |= {"fresnel": ledger[fused.LOST_BY_FRESNEL], "total_internal_reflection": ledger[fused.REFLECTED]}
+    return image, leaving, lost | {"off_screen": ledger[fused.OFF_SCREEN] + beside.detach()}
 
 
-def _arguments(
-    rays, interface: tuple[float, str], height: float, start: float, screen: Screen, filter: Filter
-) -> tuple[bool, tuple]:
-    """Whether rays are oblique, and the arguments of the `fused` kernels after the nets."""
+def _arguments(rays: RowsOfRays, interface: tuple[float, str], ends: tuple[float, float], screen: Screen, filter: Filter) -> tuple:
+    """The arguments of the `fused` kernels after the surface."""
     eta, fresnel = interface
-    oblique = rays[2] is not _NONE
-    exit_ = Exit(float(eta), axial_refraction.FRESNEL[fresnel], float(start), float(height))
-    frame = ScreenFrame(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
-    splat = Splat(filter_weights.KINDS[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
-    return oblique, (*rays, exit_, frame, splat, True if oblique else None)
+    exit_ = Exit(float(eta), FRESNEL[fresnel], *map(float, ends))
+    return rays, exit_, ScreenFrame.of(screen), Splat.of(filter), None if rays.along_x is _NONE else True
 
 
 def _layout(count: int) -> tuple[int, int]:
@@ -208,7 +185,7 @@ def compile_surface() -> None:
     heights = torch.zeros(4, 4, dtype=torch.float64, requires_grad=True)
     net, slope = AlongV(space, at, 0.5)(heights)
     found = scattered_surface(FusedSurface((space, space), (1.0, 1.0)), heights, at.numpy(), at.numpy())
-    sum(t.sum() for t in (net, slope, *found)).backward()
+    torch.stack([t.sum() for t in (net, slope, *found)]).sum().backward()
 
 
 def compile_splat() -> None:
@@ -228,10 +205,8 @@ def _example() -> tuple:
     """Arguments of `_Image` for a few rays."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2, dtype=torch.float64)
     kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, True, torch.tensor(0.25, dtype=torch.float64))
-    (x, y, flux), net = kernel.rays, torch.zeros(4, 2, dtype=torch.float64)
-    _, arguments = _arguments(
-        (x, y, _NONE, _NONE, flux), (1.5, "exact"), 10.0, 0.0, Screen((10.0, 10.0), 10.0, (4, 4)), Filter("cosine", (3, 3))
-    )
+    net, screen = torch.zeros(4, 2, dtype=torch.float64), Screen((10.0, 10.0), 10.0, (4, 4))
+    arguments = _arguments(kernel.rays, (1.5, "exact"), (0.0, 10.0), screen, Filter("cosine", (3, 3)))
     return net, net, net, kernel.rows, False, arguments, kernel.workspace
 
 
@@ -242,7 +217,7 @@ class _Image(torch.autograd.Function):
     def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace):
         images, scratch = _images(arguments, workspace)
         ledgers = np.empty((len(images), fused.COLUMNS))
-        fused.forward(ALL, images, ledgers, scratch, *rows, *_arrays(net, net_x, net_y), *arguments)
+        fused.forward(ALL, images, ledgers, scratch, _surface(rows, (net, net_x, net_y)), *arguments)
         ledger = ledgers.sum(0)
         leaving = torch.tensor(ledger[fused.LEAVING], dtype=torch.float64)
         return torch.from_numpy(pixels.total(images)), leaving, torch.from_numpy(ledger)
@@ -267,20 +242,20 @@ def _adjoint(
     """Derivatives by the three nets (n, b), a sum for each block: (3, blocks, n, b), or (3, 1, n, b) with `apart`."""
     scratch, shape = _images(arguments, workspace)[1], nets[0].shape
     sums = np.empty((3, 1, *shape)) if apart else workspace("nets", 3, len(scratch), *shape)
-    fused.backward(ALL, by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, *rows, *_arrays(*nets), *arguments)
+    fused.backward(ALL, by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, _surface(rows, nets), *arguments)
     return sums
 
 
 def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Images and scratch of all blocks, to be overwritten."""
-    x, *_, frame, splat, _ = arguments
-    count, nx, ny = blocks(), frame.pixels_x + 2 * (splat.size_x - 1), frame.pixels_y + 2 * (splat.size_y - 1)
-    images = workspace("images", count, nx, ny + -splat.size_y % 4)
-    return images, workspace("scratch", count, fused.scratch_rows(splat), x.shape[1])
+    rays, _, frame, splat, _ = arguments
+    count = blocks()
+    images = workspace("images", count, *splat.padded(frame))
+    return images, workspace("scratch", count, fused.scratch_rows(splat), rays.x.shape[1])
 
 
-def _arrays(*tensors: Tensor) -> list[np.ndarray]:
-    return [t.detach().contiguous().numpy() for t in tensors]
+def _surface(rows: tuple, nets) -> RowsOfSurface:
+    return RowsOfSurface(*rows, *(t.detach().contiguous().numpy() for t in nets))
 
 
 def scattered_points(keys, salts, start: int, stop: int, nu: int, nv: int, stratified: bool) -> tuple[Tensor, Tensor]:

@@ -20,8 +20,10 @@ from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
+from caustic_cli.optics.kernels.arguments import RowsOfSurface
 from caustic_cli.optics.kernels.banded import AlongV
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.pixels import total
 from caustic_cli.optics.kernels.rows import combine, spread
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
@@ -38,7 +40,7 @@ class GridSurface:
         (su, sv), (rx, ry) = spaces, half_size
         first, bu = su.basis(u)
         du = su.basis(u, 1)[1] / (2.0 * rx)
-        self.rows = (first.numpy(), bu.double().contiguous().numpy(), du.double().contiguous().numpy())
+        self.rows = tuple(t.contiguous().numpy() for t in (first, bu.double(), du.double()))
         self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry))
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -47,25 +49,25 @@ class GridSurface:
 
 
 @njit(entry=True, **FAST)
-def _combine(block, net, net_y, first, bu, du, z, zx, zy, blocks):
+def _combine(block, surface, z, zx, zy, blocks):
     """z and slopes (a, b)."""
     if block == ALL:
-        on_threads(blocks, (net, net_y, first, bu, du, z, zx, zy, blocks))
+        on_threads(blocks, (surface, z, zx, zy, blocks))
         return
     for i in range(block * len(z) // blocks, (block + 1) * len(z) // blocks):
-        combine(i, first, bu, du, net, net, net_y, z[i], zx[i], zy[i])
+        combine(i, surface, z[i], zx[i], zy[i])
 
 
-@njit(parallel=True, **FAST)
-def _spread(by_z, by_zx, by_zy, first, bu, du, nets):
-    """Adjoint of `_combine`: derivatives by both nets; nets (3, blocks, n, b) are overwritten, and added in order."""
+@njit(entry=True, **FAST)
+def _spread(block, by_z, by_zx, by_zy, surface, nets):
+    """Adjoint of `_combine`: derivatives by both nets, a set for each block; nets (3, blocks, n, b) are overwritten."""
     rows, blocks = len(by_z), nets.shape[1]
-    for block in prange(blocks):
-        nets[:, block] = 0.0
-        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            spread(i, first, bu, du, by_z[i], by_zx[i], by_zy[i], nets[:, block], False)
-    for block in range(1, blocks):
-        nets[:, 0] += nets[:, block]
+    if block == ALL:
+        on_threads(blocks, (by_z, by_zx, by_zy, surface, nets))
+        return
+    nets[:, block] = 0.0
+    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+        spread(i, surface, by_z[i], by_zx[i], by_zy[i], nets[:, block], False)
 
 
 class _Rows(torch.autograd.Function):
@@ -75,17 +77,18 @@ class _Rows(torch.autograd.Function):
     def forward(net: Tensor, net_y: Tensor, rows: tuple):
         shape = len(rows[0]), net.shape[1]
         out = [torch.empty(shape[0] * shape[1], dtype=torch.float64) for _ in range(3)]
-        nets = (t.detach().contiguous().numpy() for t in (net, net_y))
-        _combine(ALL, *nets, *rows, *(t.numpy().reshape(shape) for t in out), blocks())
+        nets = (t.detach().contiguous().numpy() for t in (net, net, net_y))
+        _combine(ALL, RowsOfSurface(*rows, *nets), *(t.numpy().reshape(shape) for t in out), blocks())
         return tuple(out)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.shape, ctx.rows = inputs[0].shape, inputs[2]
+        net, _, rows = inputs
+        ctx.shape, ctx.rows = net.shape, rows
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *by):
         nets, shape = np.empty((3, blocks(), *ctx.shape)), (len(ctx.rows[0]), ctx.shape[1])
-        _spread(*(b.contiguous().numpy().reshape(shape) for b in by), *ctx.rows, nets)
-        return torch.from_numpy(nets[0, 0]), torch.from_numpy(nets[2, 0]), None
+        _spread(ALL, *(b.contiguous().numpy().reshape(shape) for b in by), RowsOfSurface(*ctx.rows, *[np.empty((0, 0))] * 3), nets)
+        return torch.from_numpy(total(nets[0])), torch.from_numpy(total(nets[2])), None

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.spline import jet, piece
+from caustic_cli.optics.kernels.spline import jet, place
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, MOST_PROBES, MOST_STEPS
 
@@ -24,11 +24,11 @@ NEAR = 1e-3
 
 
 @njit(inline="always", **FAST)
-def _value(c, u, v, bu, mu, wu, bv, mv, wv):
+def value_at(c, u, v, pieces):
     """Z, Z_u, Z_v at (u, v)."""
-    i, j = piece(u, bu), piece(v, bv)
-    z, z_xi, z_eta = jet(c, i, j, (u - mu[i]) * wu[i], (v - mv[j]) * wv[j])
-    return z, z_xi * wu[i], z_eta * wv[j]
+    i, j, xi, eta = place(u, v, pieces)
+    z, z_xi, z_eta = jet(c, i, j, xi, eta)
+    return z, z_xi * pieces.over_u[i], z_eta * pieces.over_v[j]
 
 
 @njit(inline="always", **FAST)
@@ -40,7 +40,7 @@ def _leaves(o, d):
 
 
 @njit(**FAST)
-def _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv):
+def _first_bracket(low, high, f_low, ray, slope, c, pieces):
     """(a, b, found): f(a) < 0 <= f(b) around the first root in [low, high], or none (found 0), or undecided (2).
 
     No root lies between a and b if the two lines that bound f, with slope d_z + L from a and d_z - L from b, stay below 0.
@@ -51,7 +51,7 @@ def _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv):
     a, f_a, step = low, f_low, high - low
     for _ in range(MOST_PROBES):
         b = min(a + step, high)
-        z, _, _ = _value(c, ou + b * du, ov + b * dv, bu, mu, wu, bv, mv, wv)
+        z, _, _ = value_at(c, ou + b * du, ov + b * dv, pieces)
         f_b = oz + b * dz - z
         if f_b < 0.0:
             across = (f_b - f_a - fall * (b - a)) / (rise - fall)
@@ -67,14 +67,14 @@ def _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv):
 
 
 @njit(**FAST)
-def _bracket_around(start, low, high, ray, c, bu, mu, wu, bv, mv, wv):
+def _bracket_around(start, low, high, ray, c, pieces):
     """(a, b, found): the narrowest of ever wider intervals around `start` with f(a) < 0 <= f(b), inside [low, high]."""
     ou, ov, oz, du, dv, dz = ray
     reach = NEAR * (high - low)
     while True:
         a, b = max(low, start - reach), min(high, start + reach)
-        z_a, _, _ = _value(c, ou + a * du, ov + a * dv, bu, mu, wu, bv, mv, wv)
-        z_b, _, _ = _value(c, ou + b * du, ov + b * dv, bu, mu, wu, bv, mv, wv)
+        z_a, _, _ = value_at(c, ou + a * du, ov + a * dv, pieces)
+        z_b, _, _ = value_at(c, ou + b * du, ov + b * dv, pieces)
         if oz + a * dz < z_a and oz + b * dz >= z_b:
             return a, b, 1
         if a <= low and b >= high:
@@ -83,7 +83,7 @@ def _bracket_around(start, low, high, ray, c, bu, mu, wu, bv, mv, wv):
 
 
 @njit(**FAST)
-def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
+def _root(ray, start, limits, slope, c, pieces):
     """(t, status) of the first intersection.  limits: least and largest height; start: estimate of t, negative if unknown."""
     ou, ov, oz, du, dv, dz = ray
     z_low, z_high = limits
@@ -97,17 +97,17 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
     safe, f_low = slope < dz, -1.0
     opened = not (safe and start < 0.0 and low > 0.0)  # otherwise f <= 0 at low: looked at if the iteration comes there
     if opened:
-        z, _, _ = _value(c, ou + low * du, ov + low * dv, bu, mu, wu, bv, mv, wv)
+        z, _, _ = value_at(c, ou + low * du, ov + low * dv, pieces)
         f_low = oz + low * dz - z
         if f_low >= 0.0:  # on the hull's floor, which the surface then touches; or the ray begins above the surface
             return low, HIT if low > 0.0 or f_low == 0.0 else MISSED
     if start >= 0.0:
-        low, high, found = _bracket_around(min(max(start, low), high), low, high, ray, c, bu, mu, wu, bv, mv, wv)
+        low, high, found = _bracket_around(min(max(start, low), high), low, high, ray, c, pieces)
         if found == 0:
             return 0.0, MISSED
         closed = True
     elif not safe:
-        low, high, found = _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv)
+        low, high, found = _first_bracket(low, high, f_low, ray, slope, c, pieces)
         if found != 1:
             return 0.0, MISSED if found == 0 else UNRESOLVED
         closed = True
@@ -117,7 +117,7 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
     size = max(size, abs(oz))
     close, narrow = FEW_ULP * size, FEW_ULP * max(high, size)
     for _ in range(MOST_STEPS):
-        z, zu, zv = _value(c, ou + t * du, ov + t * dv, bu, mu, wu, bv, mv, wv)
+        z, zu, zv = value_at(c, ou + t * du, ov + t * dv, pieces)
         f = oz + t * dz - z
         if f < 0.0:
             low, opened = t, True
@@ -130,12 +130,12 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
             return t, HIT
         t -= step
         if t >= high and not closed:  # does the surface reach that far at all?
-            z, _, _ = _value(c, ou + high * du, ov + high * dv, bu, mu, wu, bv, mv, wv)
+            z, _, _ = value_at(c, ou + high * du, ov + high * dv, pieces)
             if oz + high * dz - z < 0.0:
                 return 0.0, MISSED
             closed = True
         if t <= low and not opened:  # does the surface touch the hull's floor there?
-            z, _, _ = _value(c, ou + low * du, ov + low * dv, bu, mu, wu, bv, mv, wv)
+            z, _, _ = value_at(c, ou + low * du, ov + low * dv, pieces)
             if oz + low * dz - z >= 0.0:
                 return low, HIT
             opened = True
@@ -145,15 +145,16 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
 
 
 @njit(entry=True, **FAST)
-def intersect(block, ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks):
-    """First intersections of rays (N,) into t and status (N,).
+def intersect(block, rays, start, limits, slopes, c, pieces, t, status, blocks):
+    """First intersections of rays (o_u, o_v, o_z, d_u, d_v, d_z), (N,) each, into t and status (N,).
 
     limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,): estimates of t, infinite for none; or
     empty, if unknown.
     """
     if block == ALL:
-        on_threads(blocks, (ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks))
+        on_threads(blocks, (rays, start, limits, slopes, c, pieces, t, status, blocks))
         return
+    ou, ov, oz, du, dv, dz = rays
     count = len(ou)
     for k in range(block * count // blocks, (block + 1) * count // blocks):
         ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
@@ -162,24 +163,20 @@ def intersect(block, ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, w
         if begin == np.inf:
             t[k], status[k] = 0.0, MISSED
             continue
-        t[k], status[k] = _root(ray, begin, limits, slope, c, bu, mu, wu, bv, mv, wv)
+        t[k], status[k] = _root(ray, begin, limits, slope, c, pieces)
 
 
 @njit(entry=True, **FAST)
-def intersect_again(
-    block, ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv, t, blocks
-):
+def intersect_again(block, rays, side, limits, slopes, round_, step, halvings, most, c, pieces, t, blocks):
     """Next intersections of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `reintersection.reference`.
 
     side: 1 above the surface, -1 under it; limits, slopes: as in `intersect`; round_: the surface ends at the circle inscribed
     in its aperture; step, halvings, most: least step (mm), bisections of the last one and most steps.
     """
     if block == ALL:
-        on_threads(
-            blocks,
-            (ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv, t, blocks),
-        )
+        on_threads(blocks, (rays, side, limits, slopes, round_, step, halvings, most, c, pieces, t, blocks))
         return
+    ou, ov, oz, du, dv, dz = rays
     count, highest = len(ou), limits[1] if side > 0.0 else -limits[0]
     for k in range(block * count // blocks, (block + 1) * count // blocks):
         t[k] = 0.0
@@ -192,7 +189,7 @@ def intersect_again(
             across = (u - 0.5) ** 2 + (v - 0.5) ** 2 if round_ else max(abs(u - 0.5), abs(v - 0.5)) ** 2
             if not across <= 0.25 or (side * dz[k] > 0.0 and side * z > highest):
                 break
-            f = side * (z - _value(c, u, v, bu, mu, wu, bv, mv, wv)[0])
+            f = side * (z - value_at(c, u, v, pieces)[0])
             if f <= 0.0:
                 if probe > 0:
                     t[k] = after
@@ -201,7 +198,7 @@ def intersect_again(
         if t[k] > 0.0:
             for _ in range(halvings):
                 middle = 0.5 * (before + after)
-                z = _value(c, ou[k] + middle * du[k], ov[k] + middle * dv[k], bu, mu, wu, bv, mv, wv)[0]
+                z = value_at(c, ou[k] + middle * du[k], ov[k] + middle * dv[k], pieces)[0]
                 if side * (oz[k] + middle * dz[k] - z) > 0.0:
                     before = middle
                 else:

@@ -14,14 +14,17 @@ from typing import Any
 import numba
 from numba import prange
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
+from numba.core.dispatcher import Dispatcher
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.kernels import cache
 
-__all__ = ["FAST", "PARALLEL", "njit", "prange"]
+__all__ = ["FAST", "PARALLEL", "SUMS", "njit", "prange"]
 
 #: Sums of products may be contracted, and zeros lose their sign; no sum is reordered, no NaN or infinity assumed away.
 FAST: dict[str, Any] = {"fastmath": {"contract", "nsz"}}
+#: Sums over many numbers, whose order is left to the compiler.
+SUMS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}}
 #: Loops over `prange` run in parallel, and nothing else: every array that is filled would be a parallel loop of its own.
 PARALLEL = {
     "prange": True,
@@ -71,6 +74,11 @@ class _Kept(FunctionCache):
 
     _impl_class = _Placed
 
+    def _index_key(self, sig, codegen):
+        """What distinguishes compiled codes of one source: of functions made in others, also the functions these are made of, by
+        their names.  Numba compares what they hold, which is never the same in another process."""
+        return sig, codegen.magic_tuple(), _made_of(self._py_func)
+
     def load_overload(self, sig, target_context):
         """The compiled code of a signature, from another process if one is compiling it; None if there is none in the cache, and
         other processes wait for this one from then on."""
@@ -95,6 +103,13 @@ class _Kept(FunctionCache):
                 self.flush()
                 super().save_overload(sig, data)
         cache.release(self._impl.filename_base)
+
+
+def _made_of(function) -> tuple:
+    """Names of a function and, recursively, of those that it is made of; and other values."""
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    made = [_made_of(v.py_func) if isinstance(v, Dispatcher) else v for v in cells]
+    return function.__module__, function.__qualname__, *made
 
 
 def njit(*, entry: bool = False, parallel: bool = False, **options):

@@ -12,11 +12,8 @@ by_v is the derivative of whatever is differentiated by v.
 
 from __future__ import annotations
 
-import numpy as np
-
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import BATCH, load, store
-from caustic_cli.optics.kernels.threads import ALL, on_threads
+from caustic_cli.optics.kernels.stage import Stage, load, store, store_flags
 
 DX, DY, DZ, GX, GY, BY_TX, BY_TY, BY_TZ, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, ROWS = range(14)
 
@@ -30,37 +27,23 @@ def _m(v, j):
 
 
 @njit(inline="always", **FAST)
-def reflect_batch(v, start, count, ray, t):
-    """A batch of `reflect`."""
+def _reflect(v, start, count, ray, _parameters, _given, out):
+    """t from d and g."""
+    t, passes = out
     for i in range(5):
         load(ray[i], start, count, v[i])
     for j in range(count):
-        _, m = _m(v, j)
+        h, m = _m(v, j)
         v[BY_TX, j], v[BY_TY, j], v[BY_TZ, j] = v[DX, j] + m * v[GX, j], v[DY, j] + m * v[GY, j], v[DZ, j] - m
+        v[BY_DX, j] = h
     for i in range(3):
         store(v[BY_TX + i], start, count, t[i])
-
-
-@njit(**FAST)
-def _reflect_some(begin, end, ray, t):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        reflect_batch(v, start, min(BATCH, end - start), ray, t)
-
-
-@njit(entry=True, **FAST)
-def reflect(block, ray, t, blocks):
-    """Directions t, three components, from ray: d and g, five components."""
-    if block == ALL:
-        on_threads(blocks, (ray, t, blocks))
-        return
-    count = len(t[0])
-    _reflect_some(block * count // blocks, (block + 1) * count // blocks, ray, t)
+    store_flags(v[BY_DX], start, count, passes)
 
 
 @njit(inline="always", **FAST)
-def pull_batch(v, start, count, ray, given, out):
-    """A batch of `reflect_adjoint`."""
+def _pull(v, start, count, ray, _parameters, given, out):
+    """The adjoint."""
     for i in range(5):
         load(ray[i], start, count, v[i])
     for i in range(3):
@@ -79,17 +62,4 @@ def pull_batch(v, start, count, ray, given, out):
         store(v[BY_DX + i], start, count, out[i])
 
 
-@njit(**FAST)
-def _pull_some(begin, end, ray, given, out):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        pull_batch(v, start, min(BATCH, end - start), ray, given, out)
-
-
-@njit(entry=True, **FAST)
-def reflect_adjoint(block, ray, given, out, count, blocks):
-    """Derivatives by the ray's components into `out`, from those by t, three components."""
-    if block == ALL:
-        on_threads(blocks, (ray, given, out, count, blocks))
-        return
-    _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, given, out)
+REFLECT = Stage.of(_reflect, _pull, ROWS, 3)

@@ -1,12 +1,12 @@
-"""Intersections of rays of any origin with a height field, differentiable by rays and heights.
+"""Intersections of rays with a height field as differentiable torch functions, by the CPU kernels of `batches`.
 
-The rays of `surface.RayIntersections` are fixed and start inside the aperture below the surface.  Behind another surface origin o
-and direction d depend on that surface, and o may lie outside this surface's aperture.  Each ray is therefore first advanced to its
-entry into the
+Rays that start inside the aperture below the surface, and do not change, are prepared once for any heights.  Behind another surface
+origin o and direction d depend on that surface, and o may lie outside this surface's aperture.  Each such ray is therefore first
+advanced to its entry into the
 
     box    aperture x [a little below the least control height, infinity)
 
-while t is still measured from o.  The search and the derivatives are those of `batches`.
+while t is still measured from o.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from caustic_cli.optics.kernels import batches, blocks
+from caustic_cli.optics.kernels import batches, blocks, intersect
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.surface import FusedSurface, _sag
+from caustic_cli.optics.kernels.surface import FusedSurface, sag_of, scaled
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 #: Depth of the box's floor below the least height, relative to the height of the hull and to the width of the aperture.
@@ -44,11 +44,94 @@ def hits_of_rays(
         t, mm, 0 where there is no hit; dz/dx, dz/dy there; found, bool.  (N,) each; t and slopes are differentiable once by
         heights, origin and direction.  A ray that starts on the surface or beyond it misses.
     """
-    if side > 0:
-        return _HitsOfRays.apply(heights, *origin, *direction, surface)[:4]
     (ox, oy, oz), (dx, dy, dz) = origin, direction
-    t, gx, gy, found, *_ = _HitsOfRays.apply(-heights, ox, oy, -oz, dx, dy, -dz, surface)
-    return t, -gx, -gy, found
+    if side < 0:
+        heights, oz, dz = -heights, -oz, -dz
+    t, gx, gy, *_ = _Hits.apply(heights, surface, None, ox, oy, oz, dx, dy, dz)
+    found = t.detach() >= 0.0
+    t = torch.where(found, t, torch.zeros_like(t))
+    return (t, -gx, -gy, found) if side < 0 else (t, gx, gy, found)
+
+
+class RayIntersections:
+    """Intersections of fixed rays from below with a height field: the fused form of `intersection.reference`.
+
+    Args:
+        origin, direction: (N,) float64 each, mm, inside the aperture, and unit vectors; z of the origins may be one number.
+        radius: of a circular aperture, mm, or None.
+    """
+
+    def __init__(self, surface: FusedSurface, origin, direction, radius: float | None):
+        self.surface, (x, y, self.z) = surface, origin
+        if isinstance(self.z, Tensor):
+            self.z = self.z.double().numpy()
+        self.rays = scaled(surface, (x, y, torch.empty_like(x)), direction)
+        self.radius = np.inf if radius is None else radius
+        self.t, self.status = np.zeros(len(x)), np.zeros(len(x), np.int8)
+        self.order, used = batches.order(*self.rays[:2], surface.pieces.breaks_u, surface.pieces.breaks_v)
+        self.batched = len(x) >= batches.CROWD * used
+        if not self.batched:
+            self.order = np.arange(len(x), dtype=np.int32)
+
+    def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Heights (n, m) mm -> distance along each ray to its hit (mm; -1 for none), dz/dx and dz/dy there, (N,) float64."""
+        return _Hits.apply(heights, self.surface, self)[:3]
+
+    def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
+        """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
+
+        start: estimates of the distances (N,), infinite for none; None if unknown.
+        """
+        if start is None:
+            c, hits = self.search(heights)
+            self.status, self.t = hits.status, np.maximum(hits.reach, 0.0)
+            return c
+        h = self._lower(heights)
+        c, pieces = self.surface.coefficients(h), self.surface.pieces
+        intersect.intersect(
+            ALL, self.rays, start, _limits(h), self.surface.slope_bounds(h), c, pieces, self.t, self.status, blocks()
+        )
+        x, y = ((o - 0.5 + self.t * d) / s for o, d, s in zip(self.rays[:2], self.rays[3:5], self.surface.scale, strict=True))
+        beyond = (x * x + y * y > self.radius**2) & (self.status == 0)  # the ray has left the lens
+        self.t[beyond], self.status[beyond] = 0.0, 1
+        return c
+
+    def search(self, heights: Tensor) -> tuple[np.ndarray, batches.Hits]:
+        """Coefficients of the surface, counted from the heights' mean, and the first intersections."""
+        h = self._lower(heights)
+        return _first_hits(self.surface, h, _limits(h), self.rays, self.order, self.batched, self.radius)
+
+    def _lower(self, heights: Tensor) -> Tensor:
+        """Heights less their mean, from which the rays then start."""
+        h, middle = sag_of(heights)
+        self.rays[2][:] = self.z - middle
+        return h
+
+
+def _limits(h: Tensor) -> tuple[float, float]:
+    return float(h.min()), float(h.max())
+
+
+def _first_hits(surface: FusedSurface, h: Tensor, limits, rays, order, batched: bool, radius: float):
+    """Coefficients, and the first intersections."""
+    c, hits = surface.coefficients(h), batches.Hits.of(len(order))
+    slopes = surface.slope_bounds(h)
+    batches.first_hits(ALL, order, batched, rays, limits, slopes, float(radius), c, surface.pieces, hits, blocks())
+    return c, hits
+
+
+def _enter_and_hit(surface: FusedSurface, heights: Tensor, o, d) -> tuple[np.ndarray, batches.Hits]:
+    """The same of rays from anywhere."""
+    h, middle = sag_of(heights)
+    low, high = _limits(h)
+    rays, way = scaled(surface, (o[0], o[1], o[2] - middle), d), np.empty(len(o[0]))
+    enter(ALL, rays, low - max(BELOW[0] * (high - low), BELOW[1] / min(surface.scale)), way, blocks())
+    order, used = batches.order(*rays[:2], surface.pieces.breaks_u, surface.pieces.breaks_v)
+    limits = low, high + 1e-6 * (high - low)  # above what touches the hull's top, by whatever rounding
+    c, hits = _first_hits(surface, h, limits, rays, order, len(way) >= batches.CROWD * used, np.inf)
+    found = (hits.status == batches.HIT) & (way + hits.reach > 0.0)
+    t, gx, gy = np.where(found, way + hits.reach, -1.0), np.where(found, hits.gx, 0.0), np.where(found, hits.gy, 0.0)
+    return c, hits._replace(reach=t, gx=gx, gy=gy, where=np.where(found[hits.met], hits.where, np.int32(-1)))
 
 
 @njit(inline="always", **FAST)
@@ -76,99 +159,49 @@ def enter_alone(ray, floor):
 
 
 @njit(entry=True, **FAST)
-def enter(block, ou, ov, oz, du, dv, dz, floor, way, blocks):
-    """Advance rays (N,) to their entry into the box, overwriting ou, ov, oz; way (N,): the distance.
+def enter(block, rays, floor, way, blocks):
+    """Advance rays, (o_u, o_v, o_z, d_u, d_v, d_z), (N,) each, to their entry into the box, overwriting o; way (N,): the distance.
 
     floor: of the box, mm.  A ray that never enters is placed outside the aperture.
     """
     if block == ALL:
-        on_threads(blocks, (ou, ov, oz, du, dv, dz, floor, way, blocks))
+        on_threads(blocks, (rays, floor, way, blocks))
         return
+    ou, ov, oz, du, dv, dz = rays
     count = len(ou)
     for k in range(block * count // blocks, (block + 1) * count // blocks):
         ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
         ou[k], ov[k], oz[k], way[k] = enter_alone(ray, floor)
 
 
-def _rays(surface: FusedSurface, o, d) -> tuple[np.ndarray, ...]:
-    """o, d mm -> o_u, o_v, o_z, d_u, d_v, d_z, float64."""
-    (su, sv), (ox, oy, oz), (dx, dy, dz) = surface.scale, o, d
-    return tuple(c.detach().double().contiguous().numpy() for c in (ox * su + 0.5, oy * sv + 0.5, oz, dx * su, dy * sv, dz))
+class _Hits(torch.autograd.Function):
+    """Heights, and fixed rays or components of others -> t (-1 for none), slopes; numbers and span products; coefficients."""
 
-
-class _HitsOfRays(torch.autograd.Function):
     @staticmethod
-    def forward(
-        heights: Tensor,
-        ox: Tensor,
-        oy: Tensor,
-        oz: Tensor,
-        dx: Tensor,
-        dy: Tensor,
-        dz: Tensor,
-        surface: FusedSurface,
-    ):
-        h, middle = _sag(heights)
-        low, high = float(h.min()), float(h.max())
-        rays, way, n = _rays(surface, (ox, oy, oz - middle), (dx, dy, dz)), np.empty(len(ox)), blocks()
-        floor = low - max(BELOW[0] * (high - low), BELOW[1] / min(surface.scale))
-        enter(ALL, *rays, floor, way, n)
-        order, used = batches.order(*rays[:2], surface.geometry[0], surface.geometry[3])
-        status, *out = batches.found(len(way))
-        top = high + 1e-6 * (high - low)  # above what touches the hull's top, by whatever rounding
-        batches.first_hits(
-            ALL,
-            order,
-            len(way) >= batches.CROWD * used,
-            *rays,
-            (low, top),
-            surface.slope_bounds(h),
-            np.inf,
-            surface.coefficients(h),
-            *surface.geometry,
-            *surface.scale,
-            status,
-            *out,
-            n,
-        )
-        reach, gx, gy, met, where = (torch.from_numpy(a) for a in out)
-        t = torch.from_numpy(way) + reach
-        found = torch.from_numpy(status == batches.HIT) & (t > 0.0)
-        zero = torch.zeros((), dtype=torch.float64)
-        where = torch.where(found[met], where, -1)
-        return *(torch.where(found, c, zero) for c in (t, gx, gy)), found, met, where
+    def forward(heights: Tensor, surface: FusedSurface, fixed: RayIntersections | None, *ray):
+        c, (_, *hits) = fixed.search(heights) if fixed else _enter_and_hit(surface, heights, ray[:3], ray[3:])
+        return *(torch.from_numpy(a) for a in hits), torch.from_numpy(c)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        *tensors, ctx.surface = inputs
-        ctx.save_for_backward(*tensors, *output)
+        heights, ctx.surface, ctx.fixed, *ray = inputs
+        ctx.save_for_backward(*output, heights, *ray)
         ctx.mark_non_differentiable(*output[3:])
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *by):
-        heights, ox, oy, oz, dx, dy, dz, t, gx, gy, _, met, where = ctx.saved_tensors
-        surface, wanted = ctx.surface, ctx.needs_input_grad
-        ou, ov, _, *directions = _rays(surface, (ox, oy, oz), (dx, dy, dz))
-        c = surface.coefficients(_sag(heights)[0])
-        grads = surface.workspace() if wanted[0] else np.empty((blocks(), 0, *c.shape[1:]))
-        starts = [torch.empty(len(t) if any(wanted[1:7]) else 0, dtype=torch.float64) for _ in range(3)]
-        batches.pull_back(
-            ALL,
-            met.numpy(),
-            where.numpy(),
-            *(b.double().contiguous().numpy() for b in by[:3]),
-            ou,
-            ov,
-            *directions,
-            *(a.detach().numpy() for a in (t, gx, gy)),
-            c,
-            *surface.geometry,
-            *surface.scale,
-            grads,
-            *(a.numpy() for a in starts),
+        *found, met, where, c, heights = ctx.saved_tensors[:7]
+        ray, surface, (for_heights, _, _, *wanted) = ctx.saved_tensors[7:], ctx.surface, ctx.needs_input_grad
+        rays = ctx.fixed.rays if ctx.fixed else scaled(surface, ray[:3], ray[3:])
+        grads = surface.workspace() if for_heights else np.empty((blocks(), 0, *c.shape[1:]))
+        starts = [torch.empty(len(met) if any(wanted) else 0, dtype=torch.float64) for _ in range(3)]
+        given, found_, starts_ = (tuple(t.detach().double().contiguous().numpy() for t in ts) for ts in (by[:3], found, starts))
+        batches.pull_back(ALL, met.numpy(), where.numpy(), given, rays, found_, c.numpy(), surface.pieces, grads, starts_)
+        out = [*starts, *(found[0].detach() * a for a in starts)] if any(wanted) else [None] * len(ray)
+        return (
+            surface.pull(grads).to(heights.dtype) if for_heights else None,
+            None,
+            None,
+            *(a if w else None for a, w in zip(out, wanted, strict=True)),
         )
-        out = [surface.pull(grads).to(heights.dtype) if wanted[0] else None]
-        out += [a if w else None for a, w in zip(starts, wanted[1:4], strict=True)]
-        out += [t * a if w else None for a, w in zip(starts, wanted[4:7], strict=True)]
-        return *out, None

@@ -20,21 +20,17 @@ by_v is the derivative of whatever is differentiated by v.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
-import numpy as np
-
-from caustic_cli.optics.kernels.axial_refraction import EXACT, SCHLICK
+from caustic_cli.optics.kernels.fresnel import cosine_behind, reflectance
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import BATCH, load, store
-from caustic_cli.optics.kernels.threads import ALL, on_threads
-from caustic_cli.optics.tolerances import CRITICAL, NORMAL
+from caustic_cli.optics.kernels.stage import Stage, load, store, store_flags
+from caustic_cli.optics.tolerances import NORMAL
 
-# Rows of a batch's scratch: the ray, intermediate results, R and its derivatives, input and output derivatives.
-DX, DY, DZ, GX, GY, P, EX, EY, EZ = range(9)
-NORM2, C, SIDE, S, PASSES, F, R, R_C, R_S, R_NORM2, R_F = range(9, 20)
-BY_TX, BY_TY, BY_TZ, BY_AFTER, BY_F, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, BY_P, BY_EX, BY_EY, BY_EZ, ROWS = range(20, 35)
+# Rows of a batch's scratch: the ray, f; t and P', or in the adjoint derivatives by them, and whether light passes; derivatives by
+# f and by the ray.
+DX, DY, DZ, GX, GY, P, EX, EY, EZ, F = range(10)
+TX, TY, TZ, AFTER, PASSES, BY_F, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, BY_P, BY_EX, BY_EY, BY_EZ, ROWS = range(10, 26)
 
 
 class Interface(NamedTuple):
@@ -46,23 +42,48 @@ class Interface(NamedTuple):
 
 
 @njit(inline="always", **FAST)
-def _load(ray, start, count, v):
-    for i in range(9):
-        load(ray[i], start, count, v[i])
+def _meet(dx, dy, dz, gx, gy, eta):
+    """|N|^2, c, sigma, s, and whether light passes."""
+    norm2, along = 1.0 + gx * gx + gy * gy, dz - dx * gx - dy * gy
+    c = abs(along)
+    s, passes = cosine_behind(norm2, c, eta)
+    return norm2, c, 1.0 if along >= 0.0 else -1.0, s, passes
 
 
 @njit(inline="always", **FAST)
-def _snell(v, count, eta):
-    """|N|^2, c, sigma, s, and 1 or 0 for whether light passes."""
-    for j in range(count):
-        gx, gy = v[GX, j], v[GY, j]
-        norm2 = 1.0 + gx * gx + gy * gy
-        along = v[DZ, j] - v[DX, j] * gx - v[DY, j] * gy
-        c = abs(along)
-        radicand = norm2 + (eta * eta) * (c * c - norm2)
-        passes = radicand > CRITICAL * norm2
-        v[NORM2, j], v[C, j], v[SIDE, j] = norm2, c, 1.0 if along >= 0.0 else -1.0
-        v[S, j], v[PASSES, j] = math.sqrt(radicand if passes else 1.0), 1.0 if passes else 0.0
+def bend(dx, dy, dz, gx, gy, f, eta, fresnel):
+    """t, 1 - R and whether light passes, of one ray."""
+    norm2, c, side, s, passes = _meet(dx, dy, dz, gx, gy, eta)
+    r, _, _, _, _ = reflectance(fresnel, eta, norm2, c, s, f)
+    gamma = side * (1.0 - eta) * (1.0 + eta) / (s + eta * c)
+    return eta * dx - gamma * gx, eta * dy - gamma * gy, eta * dz + gamma, 1.0 - r, passes
+
+
+@njit(inline="always", **FAST)
+def pull(dx, dy, dz, gx, gy, f, power, eta, fresnel, tx, ty, tz, by_after):
+    """Adjoint of `bend`: derivatives by d, g, P and f of one ray, from those by t and P'."""
+    norm2, c, side, s, passes = _meet(dx, dy, dz, gx, gy, eta)
+    r, r_c, r_s, r_norm2, r_f = reflectance(fresnel, eta, norm2, c, s, f)
+    # P'
+    by_after = by_after if passes else 0.0
+    by_r = -power * by_after
+    # R
+    by_c, by_s, by_norm2 = by_r * r_c, by_r * r_s, by_r * r_norm2
+    # t
+    under = 1.0 / (s + eta * c)
+    gamma = side * (1.0 - eta) * (1.0 + eta) * under
+    by_gamma = tz - gx * tx - gy * ty
+    # gamma
+    by_s -= gamma * by_gamma * under
+    by_c -= eta * gamma * by_gamma * under
+    # s
+    by_radicand = 0.5 * by_s / s if passes else 0.0
+    by_norm2 += by_radicand * (1.0 - eta) * (1.0 + eta)
+    by_c += by_radicand * 2.0 * eta * eta * c
+    # c and |N|^2
+    by_c *= side
+    by_gx, by_gy = 2.0 * gx * by_norm2 - by_c * dx - gamma * tx, 2.0 * gy * by_norm2 - by_c * dy - gamma * ty
+    return eta * tx - by_c * gx, eta * ty - by_c * gy, eta * tz + by_c, by_gx, by_gy, (1.0 - r) * by_after, by_r * r_f
 
 
 @njit(inline="always", **FAST)
@@ -82,107 +103,6 @@ def _part(v, count, polarised):
         for j in range(count):
             _, _, _, a, q = _across(v, j)
             v[F, j] = a * a / max(q, NORMAL) if q > NORMAL else 0.5
-
-
-@njit(inline="always", **FAST)
-def _reflectance(v, count, eta, fresnel):
-    """R and its derivatives by c, s, |N|^2 and f."""
-    if fresnel == EXACT:
-        for j in range(count):
-            c, s, f = v[C, j], v[S, j], v[F, j]
-            us, up = 1.0 / (eta * c + s), 1.0 / (c + eta * s)
-            rs, rp = (eta * c - s) * us, (c - eta * s) * up
-            by_ratio = 4.0 * eta * (f * rs * us * us + (1.0 - f) * rp * up * up)
-            v[R, j], v[R_F, j] = f * rs * rs + (1.0 - f) * rp * rp, rs * rs - rp * rp
-            v[R_C, j], v[R_S, j], v[R_NORM2, j] = by_ratio * s, -by_ratio * c, 0.0
-    elif fresnel == SCHLICK:
-        r0, front = ((eta - 1.0) / (eta + 1.0)) ** 2, 0.0 if eta > 1.0 else 1.0
-        for j in range(count):
-            over = 1.0 / math.sqrt(v[NORM2, j])
-            k = (front * v[C, j] + (1.0 - front) * v[S, j]) * over
-            x = 1.0 - k
-            x4 = x * x * x * x
-            by_k = -5.0 * (1.0 - r0) * x4
-            v[R, j], v[R_F, j] = r0 + (1.0 - r0) * x4 * x, 0.0
-            v[R_C, j], v[R_S, j], v[R_NORM2, j] = front * by_k * over, (1.0 - front) * by_k * over, -0.5 * by_k * k * over * over
-    else:
-        for j in range(count):
-            v[R, j], v[R_C, j], v[R_S, j], v[R_NORM2, j], v[R_F, j] = 0.0, 0.0, 0.0, 0.0, 0.0
-
-
-@njit(inline="always", **FAST)
-def _prepare(v, count, surface):
-    _snell(v, count, surface.eta)
-    _part(v, count, surface.polarised)
-    _reflectance(v, count, surface.eta, surface.fresnel)
-
-
-@njit(inline="always", **FAST)
-def refract_batch(v, start, count, ray, surface, t, after, passes):
-    """A batch of `refract`."""
-    eta = surface.eta
-    _load(ray, start, count, v)
-    _prepare(v, count, surface)
-    for j in range(count):
-        gamma = v[SIDE, j] * (1.0 - eta) * (1.0 + eta) / (v[S, j] + eta * v[C, j])
-        v[BY_TX, j] = eta * v[DX, j] - gamma * v[GX, j]
-        v[BY_TY, j] = eta * v[DY, j] - gamma * v[GY, j]
-        v[BY_TZ, j] = eta * v[DZ, j] + gamma
-        v[BY_AFTER, j] = v[P, j] * (1.0 - v[R, j]) if v[PASSES, j] > 0.0 else 0.0
-    for i in range(3):
-        store(v[BY_TX + i], start, count, t[i])
-    store(v[BY_AFTER], start, count, after)
-    batch = passes[start : start + count]
-    for j in range(count):
-        batch[j] = v[PASSES, j] > 0.0
-
-
-@njit(**FAST)
-def _refract_some(begin, end, ray, surface, t, after, passes):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        refract_batch(v, start, min(BATCH, end - start), ray, surface, t, after, passes)
-
-
-@njit(entry=True, **FAST)
-def refract(block, ray, surface, t, after, passes, blocks):
-    """Directions t, powers `after` and whether light passes (N,), from ray: d, g, P and E, nine components."""
-    if block == ALL:
-        on_threads(blocks, (ray, surface, t, after, passes, blocks))
-        return
-    count = len(after)
-    _refract_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, t, after, passes)
-
-
-@njit(inline="always", **FAST)
-def _pull(v, count, eta):
-    """Adjoint but for f, whose derivative is left in BY_F."""
-    for j in range(count):
-        passes, side, c, s, gx, gy = v[PASSES, j], v[SIDE, j], v[C, j], v[S, j], v[GX, j], v[GY, j]
-        tx, ty, tz, by_after = v[BY_TX, j], v[BY_TY, j], v[BY_TZ, j], passes * v[BY_AFTER, j]
-        # P'
-        by_r = -v[P, j] * by_after
-        v[BY_P, j] = (1.0 - v[R, j]) * by_after
-        # R
-        v[BY_F, j], by_c, by_s, by_norm2 = by_r * v[R_F, j], by_r * v[R_C, j], by_r * v[R_S, j], by_r * v[R_NORM2, j]
-        # t
-        under = 1.0 / (s + eta * c)
-        gamma = side * (1.0 - eta) * (1.0 + eta) * under
-        by_gamma = tz - gx * tx - gy * ty
-        # gamma
-        by_s -= gamma * by_gamma * under
-        by_c -= eta * gamma * by_gamma * under
-        # s
-        by_radicand = 0.5 * passes * by_s / s
-        by_norm2 += by_radicand * (1.0 - eta) * (1.0 + eta)
-        by_c += by_radicand * 2.0 * eta * eta * c
-        # c and |N|^2
-        by_c *= side
-        v[BY_DX, j] = eta * tx - by_c * gx
-        v[BY_DY, j] = eta * ty - by_c * gy
-        v[BY_DZ, j] = eta * tz + by_c
-        v[BY_GX, j] = 2.0 * gx * by_norm2 - by_c * v[DX, j] - gamma * tx
-        v[BY_GY, j] = 2.0 * gy * by_norm2 - by_c * v[DY, j] - gamma * ty
 
 
 @njit(inline="always", **FAST)
@@ -206,30 +126,45 @@ def _pull_part(v, count):
 
 
 @njit(inline="always", **FAST)
-def pull_batch(v, start, count, ray, surface, given, out):
-    """A batch of `refract_adjoint`."""
+def _load(ray, start, count, v):
+    for i in range(9):
+        load(ray[i], start, count, v[i])
+
+
+@njit(inline="always", **FAST)
+def _refract(v, start, count, ray, surface, _given, out):
+    """t, P' and whether light passes, from d, g, P and E."""
+    results, passes = out
+    _load(ray, start, count, v)
+    _part(v, count, surface.polarised)
+    for j in range(count):
+        tx, ty, tz, kept, passing = bend(v[DX, j], v[DY, j], v[DZ, j], v[GX, j], v[GY, j], v[F, j], surface.eta, surface.fresnel)
+        v[TX, j], v[TY, j], v[TZ, j] = tx, ty, tz
+        v[AFTER, j], v[PASSES, j] = v[P, j] * kept if passing else 0.0, 1.0 if passing else 0.0
+    for i in range(4):
+        store(v[TX + i], start, count, results[i])
+    store_flags(v[PASSES], start, count, passes)
+
+
+@njit(inline="always", **FAST)
+def _refract_adjoint(v, start, count, ray, surface, given, out):
+    """Derivatives by d, g, P and E, from those by t and P'."""
+    eta, fresnel = surface.eta, surface.fresnel
     _load(ray, start, count, v)
     for i in range(4):
-        load(given[i], start, count, v[BY_TX + i])
-    _prepare(v, count, surface)
-    _pull(v, count, surface.eta)
+        load(given[i], start, count, v[TX + i])
+    _part(v, count, surface.polarised)
+    for j in range(count):
+        d_x, d_y, d_z, g_x, g_y, f, power = v[DX, j], v[DY, j], v[DZ, j], v[GX, j], v[GY, j], v[F, j], v[P, j]
+        by_dx, by_dy, by_dz, by_gx, by_gy, by_p, by_f = pull(
+            d_x, d_y, d_z, g_x, g_y, f, power, eta, fresnel, v[TX, j], v[TY, j], v[TZ, j], v[AFTER, j]
+        )
+        v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j], v[BY_GX, j], v[BY_GY, j] = by_dx, by_dy, by_dz, by_gx, by_gy
+        v[BY_P, j], v[BY_F, j] = by_p, by_f
     if surface.polarised:
         _pull_part(v, count)
     for i in range(9):
         store(v[BY_DX + i], start, count, out[i])
 
 
-@njit(**FAST)
-def _pull_some(begin, end, ray, surface, given, out):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        pull_batch(v, start, min(BATCH, end - start), ray, surface, given, out)
-
-
-@njit(entry=True, **FAST)
-def refract_adjoint(block, ray, surface, given, out, count, blocks):
-    """Derivatives by the ray's components into `out`, from those by t and P', four components."""
-    if block == ALL:
-        on_threads(blocks, (ray, surface, given, out, count, blocks))
-        return
-    _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, given, out)
+REFRACT = Stage.of(_refract, _refract_adjoint, ROWS, 4)

@@ -1,8 +1,29 @@
-"""A row of the surface from nets contracted along v, and the adjoint, for the CPU kernels."""
+"""Rows of rays: the vectors of a row in a block's scratch, and the surface there from nets contracted along v, with the adjoint."""
 
 from __future__ import annotations
 
 from caustic_cli.optics.kernels.jit import FAST, njit
+
+# Vectors of a row: the surface, powers, landing points, derivatives, normalisation of the results of `filter_weights`, the rays'
+# points and powers; then `SCRATCH` more for internal use.
+SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, BY_SAG, BY_GX, BY_GY, REACH = range(15)
+OVER_X, OVER_Y, LEAN_X, LEAN_Y, X, Y, FLUX, VECTORS = range(15, 23)
+SCRATCH = 5
+#: Powers of rays that are totally reflected or miss the surface, and the pixel coordinate of those that never arrive at the screen.
+REFLECTED_POWER, MISSED_POWER, BESIDE = -1.0, -2.0, -1e300
+
+
+@njit(**FAST)
+def load(row, out):
+    """Copy a row, possibly a repeated value, to contiguous memory, since only contiguous loops are vectorised."""
+    if row.strides[0] == 0:
+        out[:] = row[0]
+    elif row.strides[0] == 8:  # a stride known at compile time: this copy is vectorised
+        for j in range(len(out)):
+            out[j] = row[j]
+    else:
+        for j in range(len(out)):
+            out[j] = row[j]
 
 
 @njit(**FAST)
@@ -27,16 +48,18 @@ def _weighted(weights, net, first, out):
 
 
 @njit(inline="always", **FAST)
-def combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy):
-    """Row i of the surface from the nets already contracted along v: sag, dz/dx, dz/dy (b,)."""
-    _weighted(bu[i], net, first[i], sag)
-    _weighted(du[i], net_x, first[i], gx)
-    _weighted(bu[i], net_y, first[i], gy)
+def combine(i, surface, sag, gx, gy):
+    """Row i of the surface: sag, dz/dx, dz/dy (b,)."""
+    first = surface.first[i]
+    _weighted(surface.bu[i], surface.net, first, sag)
+    _weighted(surface.du[i], surface.net_x, first, gx)
+    _weighted(surface.bu[i], surface.net_y, first, gy)
 
 
 @njit(**FAST)
-def spread(i, first, bu, du, by_sag, by_gx, by_gy, nets, apart):
+def spread(i, surface, by_sag, by_gx, by_gy, nets, apart):
     """Adjoint of `combine`: add the derivatives by row i to those by the nets (3, n, b)."""
+    bu, du, first = surface.bu, surface.du, surface.first
     for a in range(bu.shape[1]):
         if apart:
             _add(bu[i, a], by_sag, nets[0, first[i] + a])

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +22,19 @@ import torch
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.threads import ALL, on_threads
+
+
+class Pieces(NamedTuple):
+    """The polynomial pieces along u and v: breaks (I + 1,), middles (I,) and one over widths (I,), and du/dx and dv/dy, per mm."""
+
+    breaks_u: Any
+    middle_u: Any
+    over_u: Any
+    breaks_v: Any
+    middle_v: Any
+    over_v: Any
+    scale_x: float
+    scale_y: float
 
 
 class Axis:
@@ -112,6 +126,13 @@ def piece(x, breaks):
 
 
 @njit(inline="always", **FAST)
+def place(u, v, pieces):
+    """The span product (i, j) of a point, and xi, eta there."""
+    i, j = piece(u, pieces.breaks_u), piece(v, pieces.breaks_v)
+    return i, j, (u - pieces.middle_u[i]) * pieces.over_u[i], (v - pieces.middle_v[j]) * pieces.over_v[j]
+
+
+@njit(inline="always", **FAST)
 def jet(c, i, j, xi, eta):
     """z and its derivatives by xi and eta."""
     p, q = c.shape[2], c.shape[3]
@@ -167,16 +188,16 @@ def push_powers(grad, i, j, xi, eta, by_z, by_xi, by_eta, powers):
 
 
 @njit(entry=True, **FAST)
-def evaluate(block, u, v, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks):
-    """Height and slopes at points (u, v) (N,) into z, zx, zy (N,): breaks, middles, one over widths of the pieces."""
+def evaluate(block, u, v, c, pieces, z, zx, zy, blocks):
+    """Height and slopes at points (u, v) (N,) into z, zx, zy (N,)."""
     if block == ALL:
-        on_threads(blocks, (u, v, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks))
+        on_threads(blocks, (u, v, c, pieces, z, zx, zy, blocks))
         return
     count = len(u)
     for k in range(block * count // blocks, (block + 1) * count // blocks):
-        i, j = piece(u[k], bu), piece(v[k], bv)
-        value, along, across = jet(c, i, j, (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j])
-        z[k], zx[k], zy[k] = value, along * wu[i] * scale_x, across * wv[j] * scale_y
+        i, j, xi, eta = place(u[k], v[k], pieces)
+        value, along, across = jet(c, i, j, xi, eta)
+        z[k], zx[k], zy[k] = value, along * pieces.over_u[i] * pieces.scale_x, across * pieces.over_v[j] * pieces.scale_y
 
 
 @njit(inline="always", **FAST)
@@ -192,19 +213,20 @@ def _basis(matrix, x, out):
 
 
 @njit(entry=True, **FAST)
-def evaluate_net(block, u, v, net, fu, tu, fv, tv, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks):
+def evaluate_net(block, u, v, net, linear, pieces, z, zx, zy, blocks):
     """`evaluate` from the control heights (n, m) themselves, whose coefficients take longer where pieces are more than points.
 
-    fu, tu, fv, tv: `first` and `matrices` of both axes.
+    linear: `first` and `matrices` of both axes.
     """
     if block == ALL:
-        on_threads(blocks, (u, v, net, fu, tu, fv, tv, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks))
+        on_threads(blocks, (u, v, net, linear, pieces, z, zx, zy, blocks))
         return
+    fu, tu, fv, tv = linear
     count, along_u, along_v = len(u), np.empty((2, tu.shape[1])), np.empty((2, tv.shape[1]))
     for k in range(block * count // blocks, (block + 1) * count // blocks):
-        i, j = piece(u[k], bu), piece(v[k], bv)
-        _basis(tu[i], (u[k] - mu[i]) * wu[i], along_u)
-        _basis(tv[j], (v[k] - mv[j]) * wv[j], along_v)
+        i, j, xi, eta = place(u[k], v[k], pieces)
+        _basis(tu[i], xi, along_u)
+        _basis(tv[j], eta, along_v)
         value, by_x, by_y = 0.0, 0.0, 0.0
         for a in range(len(tu[i])):
             row, slope = 0.0, 0.0
@@ -215,29 +237,20 @@ def evaluate_net(block, u, v, net, fu, tu, fv, tv, bu, mu, wu, bv, mv, wv, scale
             value += row * along_u[0, a]
             by_x += row * along_u[1, a]
             by_y += slope * along_u[0, a]
-        z[k], zx[k], zy[k] = value, by_x * wu[i] * scale_x, by_y * wv[j] * scale_y
+        z[k], zx[k], zy[k] = value, by_x * pieces.over_u[i] * pieces.scale_x, by_y * pieces.over_v[j] * pieces.scale_y
 
 
 @njit(entry=True, **FAST)
-def pull_back(block, u, v, gz, gx, gy, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads):
+def pull_back(block, u, v, gz, gx, gy, pieces, grads):
     """Adjoint of `evaluate`: derivatives by the coefficients into grads (blocks, I, J, p + 1, q + 1), overwritten."""
     count, blocks = len(u), len(grads)
     if block == ALL:
-        on_threads(blocks, (u, v, gz, gx, gy, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads))
+        on_threads(blocks, (u, v, gz, gx, gy, pieces, grads))
         return
     grad = grads[block]
     grad[:] = 0.0
     powers = np.empty((2, grad.shape[3]))
     for k in range(block * count // blocks, (block + 1) * count // blocks):
-        i, j = piece(u[k], bu), piece(v[k], bv)
-        push_powers(
-            grad,
-            i,
-            j,
-            (u[k] - mu[i]) * wu[i],
-            (v[k] - mv[j]) * wv[j],
-            gz[k],
-            gx[k] * wu[i] * scale_x,
-            gy[k] * wv[j] * scale_y,
-            powers,
-        )
+        i, j, xi, eta = place(u[k], v[k], pieces)
+        by_xi, by_eta = gx[k] * pieces.over_u[i] * pieces.scale_x, gy[k] * pieces.over_v[j] * pieces.scale_y
+        push_powers(grad, i, j, xi, eta, gz[k], by_xi, by_eta, powers)

@@ -1,4 +1,4 @@
-"""Evaluation and intersection of a height field as differentiable torch functions of the control heights, by the CPU kernels."""
+"""Evaluation of a height field as a differentiable torch function of the control heights, by the CPU kernels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class FusedSurface:
         self.shape = tuple(s.n for s in spaces)
         self.scale = (0.5 / half_size[0], 0.5 / half_size[1])
         self.linear = tuple(x for a in self.axes for x in (a.first, a.matrices))
-        self.geometry = tuple(x for a in self.axes for x in a.geometry)
+        self.pieces = spline.Pieces._make((*(x for a in self.axes for x in a.geometry), *self.scale))
         self.grads: np.ndarray | None = None
         self.last: tuple[Tensor, np.ndarray] | None = None
 
@@ -43,17 +43,23 @@ class FusedSurface:
     def evaluate(self, heights: Tensor, u: np.ndarray, v: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
         """z mm, dz/dx and dz/dy at points in [0, 1]^2, all (N,) float64."""
         found = [torch.empty(len(u), dtype=torch.float64) for _ in range(3)]
-        ends = (*self.geometry, *self.scale, *(t.numpy() for t in found), blocks())
+        ends = (self.pieces, *(t.numpy() for t in found), blocks())
         if len(u) < FEW * math.prod(self._coefficients()[:2]):
-            spline.evaluate_net(ALL, u, v, heights.detach().double().contiguous().numpy(), *self.linear, *ends)
+            spline.evaluate_net(ALL, u, v, heights.detach().double().contiguous().numpy(), self.linear, *ends)
         else:
             spline.evaluate(ALL, u, v, self.coefficients(heights), *ends)
         return found[0], found[1], found[2]
 
+    def pull_at(self, u: np.ndarray, v: np.ndarray, *by: Tensor) -> Tensor:
+        """Adjoint of `evaluate`: derivatives by the heights, (n, m) float64."""
+        grads = self.workspace()
+        spline.pull_back(ALL, u, v, *(g.contiguous().numpy() for g in by), self.pieces, grads)
+        return self.pull(grads)
+
     def order(self, x: Tensor, y: Tensor) -> tuple[np.ndarray, int]:
         """Points (N,), mm, in order of their span products, and how many of these there are."""
         u, v = ((c.double() * s + 0.5).contiguous().numpy() for c, s in zip((x, y), self.scale, strict=True))
-        return batches.order(u, v, self.geometry[0], self.geometry[3])
+        return batches.order(u, v, self.pieces.breaks_u, self.pieces.breaks_v)
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
         """Bounds of |Z_u| and |Z_v| over [0, 1]^2, mm, from the control nets of the derivatives."""
@@ -78,14 +84,17 @@ class FusedSurface:
         return *(len(a.first) for a in self.axes), *(a.matrices.shape[1] for a in self.axes)
 
 
-def scattered_surface(surface: FusedSurface, heights: Tensor, u: np.ndarray, v: np.ndarray):
-    """Heights (n, m) mm, points in [0, 1]^2 (N,) -> z mm, dz/dx, dz/dy (N,) float64, linear in the heights."""
+def scattered_surface(surface, heights: Tensor, u, v) -> tuple[Tensor, Tensor, Tensor]:
+    """Heights (n, m) mm, points in [0, 1]^2 (N,) -> z mm, dz/dx, dz/dy (N,) float64, linear in the heights.
+
+    surface: a `FusedSurface`, or another that evaluates itself at the points as they are given, on its own device.
+    """
     return _ScatteredSurface.apply(heights, surface, u, v)
 
 
 class _ScatteredSurface(torch.autograd.Function):
     @staticmethod
-    def forward(heights: Tensor, surface: FusedSurface, u: np.ndarray, v: np.ndarray):
+    def forward(heights: Tensor, surface, u, v):
         return surface.evaluate(heights, u, v)
 
     @staticmethod
@@ -97,153 +106,29 @@ class _ScatteredSurface(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, *by):
         surface, u, v = ctx.rest
-        grads = surface.workspace()
-        spline.pull_back(ALL, u, v, *(g.contiguous().numpy() for g in by), *surface.geometry, *surface.scale, grads)
-        return surface.pull(grads).to(ctx.heights_dtype), None, None, None
+        return surface.pull_at(u, v, *by).to(ctx.heights_dtype), None, None, None
 
 
-def _sag(heights: Tensor) -> tuple[Tensor, float]:
+def sag_of(heights: Tensor) -> tuple[Tensor, float]:
     """Heights (n, m) minus their mean, float64, and the mean, mm: a sag small compared with the thickness keeps all its digits."""
     h = heights.detach().double()
     middle = float(h.mean())
     return h - middle, middle
 
 
+def scaled(surface: FusedSurface, o, d) -> tuple[np.ndarray, ...]:
+    """o, d mm -> o_u, o_v, o_z, d_u, d_v, d_z, float64."""
+    (su, sv), (ox, oy, oz), (dx, dy, dz) = surface.scale, o, d
+    return tuple(c.detach().double().contiguous().numpy() for c in (ox * su + 0.5, oy * sv + 0.5, oz, dx * su, dy * sv, dz))
+
+
 def next_intersections(
     surface: FusedSurface, heights: Tensor, o, d, below: bool, round: bool, step: float, halvings: int, most: int
 ) -> Tensor:
     """The fused form of `reintersection.reference`: distances (N,) mm, 0 for none."""
-    h, middle = _sag(heights)
-    rays = (
-        o[0] * surface.scale[0] + 0.5,
-        o[1] * surface.scale[1] + 0.5,
-        o[2] - middle,
-        d[0] * surface.scale[0],
-        d[1] * surface.scale[1],
-        d[2],
-    )
-    t = np.empty(len(o[0]))
-    intersect.intersect_again(
-        ALL,
-        *(c.contiguous().numpy() for c in rays),
-        -1.0 if below else 1.0,
-        (float(h.min()), float(h.max())),
-        surface.slope_bounds(h),
-        round,
-        step,
-        halvings,
-        most,
-        surface.coefficients(h),
-        *surface.geometry,
-        t,
-        blocks(),
-    )
+    h, middle = sag_of(heights)
+    limits, t = (float(h.min()), float(h.max())), np.empty(len(o[0]))
+    rays, search = scaled(surface, (o[0], o[1], o[2] - middle), d), (round, step, halvings, most)
+    c, slopes = surface.coefficients(h), surface.slope_bounds(h)
+    intersect.intersect_again(ALL, rays, -1.0 if below else 1.0, limits, slopes, *search, c, surface.pieces, t, blocks())
     return torch.from_numpy(t)
-
-
-class RayIntersections:
-    """Intersections of fixed rays from below with a height field: the fused form of `intersection.reference`.
-
-    Args:
-        origin, direction: (N,) float64 each, mm, inside the aperture, and unit vectors; z of the origins may be one number.
-        radius: of a circular aperture, mm, or None.
-    """
-
-    def __init__(self, surface: FusedSurface, origin, direction, radius: float | None):
-        self.surface = surface
-        (x, y, self.z), (dx, dy, dz), (su, sv) = origin, direction, surface.scale
-        if isinstance(self.z, Tensor):
-            self.z = self.z.double().numpy()
-        self.rays = tuple(
-            t.double().contiguous().numpy() for t in (x * su + 0.5, y * sv + 0.5, torch.empty_like(x), dx * su, dy * sv, dz)
-        )
-        self.radius = np.inf if radius is None else radius
-        self.t, self.status = np.zeros(len(x)), np.zeros(len(x), np.int8)
-        self.order, used = surface.order(x, y)
-        self.batched = len(x) >= batches.CROWD * used
-        if not self.batched:
-            self.order = np.arange(len(x), dtype=np.int32)
-
-    def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Heights (n, m) mm -> distance along each ray to its hit (mm; -1 for none), dz/dx and dz/dy there, (N,) float64."""
-        return _Hits.apply(heights, self)[:3]
-
-    def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
-        """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
-
-        start: estimates of the distances (N,), infinite for none; None if unknown.
-        """
-        if start is None:
-            c, self.status, reach, *_ = self.search(heights)
-            self.t = np.maximum(reach, 0.0)
-            return c
-        c, limits, slopes = self._shape(heights)
-        intersect.intersect(ALL, *self.rays, start, limits, slopes, c, *self.surface.geometry, self.t, self.status, blocks())
-        x, y = ((o - 0.5 + self.t * d) / s for o, d, s in zip(self.rays[:2], self.rays[3:5], self.surface.scale, strict=True))
-        beyond = (x * x + y * y > self.radius**2) & (self.status == 0)  # the ray has left the lens
-        self.t[beyond], self.status[beyond] = 0.0, 1
-        return c
-
-    def search(self, heights: Tensor) -> tuple[np.ndarray, ...]:
-        """Coefficients of the surface, and the results of `batches.first_hits`."""
-        c, *bounds = self._shape(heights)
-        out = batches.found(len(self.t))
-        batches.first_hits(
-            ALL,
-            self.order,
-            self.batched,
-            *self.rays,
-            *bounds,
-            self.radius,
-            c,
-            *self.surface.geometry,
-            *self.surface.scale,
-            *out,
-            blocks(),
-        )
-        return c, *out
-
-    def _shape(self, heights: Tensor) -> tuple:
-        """Coefficients counted from the heights' mean, from which the rays then start; limits and slopes, as of
-        `batches.first_hits`."""
-        h, middle = _sag(heights)
-        self.rays[2][:] = self.z - middle
-        return self.surface.coefficients(h), (float(h.min()), float(h.max())), self.surface.slope_bounds(h)
-
-
-class _Hits(torch.autograd.Function):
-    @staticmethod
-    def forward(heights: Tensor, rays: RayIntersections):
-        c, _, *out = rays.search(heights)
-        return *(torch.from_numpy(a) for a in out), torch.from_numpy(c)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        heights, ctx.rays = inputs
-        ctx.save_for_backward(heights, *output)
-        ctx.mark_non_differentiable(*output[3:])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *by):
-        heights, *found, met, where, c = ctx.saved_tensors
-        surface, (ou, ov, _, *directions) = ctx.rays.surface, ctx.rays.rays
-        grads, none = surface.workspace(), np.empty(0)
-        batches.pull_back(
-            ALL,
-            met.numpy(),
-            where.numpy(),
-            *(g.contiguous().numpy() for g in by[:3]),
-            ou,
-            ov,
-            *directions,
-            *(t.detach().numpy() for t in found),
-            c.numpy(),
-            *surface.geometry,
-            *surface.scale,
-            grads,
-            none,
-            none,
-            none,
-        )
-        return surface.pull(grads).to(heights.dtype), None

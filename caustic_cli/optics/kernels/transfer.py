@@ -15,18 +15,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-import torch
-from torch import Tensor
-from torch.autograd.function import once_differentiable
-
-from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import BATCH, components, given, keep, kept, load, new, store, wanted
-from caustic_cli.optics.kernels.threads import ALL, on_threads
+from caustic_cli.optics.kernels.stage import Stage, here, load, store, store_flags
 from caustic_cli.optics.tolerances import PARALLEL
 
-OX, OY, OZ, DX, DY, DZ, K, OVER, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY, BY_DZ, ROWS = range(18)
+OX, OY, OZ, DX, DY, DZ, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY, BY_DZ, ROWS = range(16)
 
 Vector = tuple[float, float, float]
 
@@ -49,7 +42,74 @@ class TargetPlane(NamedTuple):
     forward: float
 
 
-def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float):
+@njit(inline="always", **FAST)
+def _path(ox, oy, oz, dx, dy, dz, plane):
+    """k, 1 / v, and whether the ray is on its way."""
+    nx, ny, nz = plane.nx, plane.ny, plane.nz
+    speed = dx * nx + dy * ny + dz * nz
+    away = (plane.px - ox) * nx + (plane.py - oy) * ny + (plane.pz - oz) * nz
+    arrives = plane.forward * speed > PARALLEL
+    over = 1.0 / (speed if arrives else 1.0)
+    k = away * over
+    on_way = arrives & (k > 0.0)
+    return k if on_way else 0.0, over, on_way
+
+
+@njit(inline="always", **FAST)
+def arrive(ox, oy, oz, dx, dy, dz, plane):
+    """x and y of one ray, and whether it is on its way."""
+    k, _, on_way = _path(ox, oy, oz, dx, dy, dz, plane)
+    rx, ry, rz = (ox - plane.px) + k * dx, (oy - plane.py) + k * dy, (oz - plane.pz) + k * dz
+    return rx * plane.ax + ry * plane.ay + rz * plane.az, rx * plane.bx + ry * plane.by + rz * plane.bz, on_way
+
+
+@njit(inline="always", **FAST)
+def pull(ox, oy, oz, dx, dy, dz, plane, x, y):
+    """Adjoint of `arrive`: derivatives by o and d, from those by x and y."""
+    k, over, on_way = _path(ox, oy, oz, dx, dy, dz, plane)
+    # x and y
+    rx, ry, rz = x * plane.ax + y * plane.bx, x * plane.ay + y * plane.by, x * plane.az + y * plane.bz
+    # r
+    by_k = rx * dx + ry * dy + rz * dz
+    # k
+    by_away = by_k * over if on_way else 0.0
+    by_ox, by_oy, by_oz = rx - by_away * plane.nx, ry - by_away * plane.ny, rz - by_away * plane.nz
+    return by_ox, by_oy, by_oz, k * by_ox, k * by_oy, k * by_oz
+
+
+@njit(inline="always", **FAST)
+def _land(v, start, count, ray, plane, _given, out):
+    """x, y and whether the ray is on its way, from o and d."""
+    (x, y), on_way = out
+    for i in range(6):
+        load(ray[i], start, count, v[i])
+    for j in range(count):
+        x_, y_, arrives = arrive(v[OX, j], v[OY, j], v[OZ, j], v[DX, j], v[DY, j], v[DZ, j], plane)
+        v[X, j], v[Y, j], v[ON_WAY, j] = x_, y_, 1.0 if arrives else 0.0
+    store(v[X], start, count, x)
+    store(v[Y], start, count, y)
+    store_flags(v[ON_WAY], start, count, on_way)
+
+
+@njit(inline="always", **FAST)
+def _land_adjoint(v, start, count, ray, plane, given, out):
+    """Derivatives by o and d, from those by x and y."""
+    for i in range(6):
+        load(ray[i], start, count, v[i])
+    load(given[0], start, count, v[X])
+    load(given[1], start, count, v[Y])
+    for j in range(count):
+        v[BY_OX, j], v[BY_OY, j], v[BY_OZ, j], v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = pull(
+            v[OX, j], v[OY, j], v[OZ, j], v[DX, j], v[DY, j], v[DZ, j], plane, v[X, j], v[Y, j]
+        )
+    for i in range(6):
+        store(v[BY_OX + i], start, count, out[i])
+
+
+LAND = Stage.of(_land, _land_adjoint, ROWS, 2)
+
+
+def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float, *, on=here):
     """Intersections of rays with a plane.
 
     Args:
@@ -57,126 +117,11 @@ def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], 
         point: of the plane, where its coordinates are 0.
         axes: unit vectors along its x and y, and its normal.
         forward: 1 for rays that arrive with d . normal > 0, -1 for those that arrive against it.
+        on: what makes the stage one of the rays' device.
 
     Returns:
         x, y: (N,) in the plane; of rays that are not on their way to it those of their origin, and meaningless.
         on_way: (N,) bool.
     """
     plane = TargetPlane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
-    return _Landing.apply(*origin, *direction, plane)
-
-
-@njit(inline="always", **FAST)
-def _path(ray, start, count, plane, v):
-    """k, 1 / v, and 1 or 0 for whether the ray is on its way, into a batch's scratch."""
-    for i in range(6):
-        load(ray[i], start, count, v[i])
-    px, py, pz, nx, ny, nz, forward = plane.px, plane.py, plane.pz, plane.nx, plane.ny, plane.nz, plane.forward
-    for j in range(count):
-        speed = v[DX, j] * nx + v[DY, j] * ny + v[DZ, j] * nz
-        away = (px - v[OX, j]) * nx + (py - v[OY, j]) * ny + (pz - v[OZ, j]) * nz
-        arrives = forward * speed > PARALLEL
-        over = 1.0 / (speed if arrives else 1.0)
-        k = away * over
-        on_way = arrives & (k > 0.0)
-        v[K, j], v[OVER, j], v[ON_WAY, j] = k if on_way else 0.0, over, 1.0 if on_way else 0.0
-
-
-@njit(inline="always", **FAST)
-def land_batch(v, start, count, ray, plane, x, y, on_way):
-    """A batch of `_land`."""
-    px, py, pz, ax, ay, az, bx, by, bz, _, _, _, _ = plane
-    _path(ray, start, count, plane, v)
-    for j in range(count):
-        k = v[K, j]
-        rx, ry, rz = (v[OX, j] - px) + k * v[DX, j], (v[OY, j] - py) + k * v[DY, j], (v[OZ, j] - pz) + k * v[DZ, j]
-        v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
-    store(v[X], start, count, x)
-    store(v[Y], start, count, y)
-    batch = on_way[start : start + count]
-    for j in range(count):
-        batch[j] = v[ON_WAY, j] > 0.0
-
-
-@njit(**FAST)
-def _land_some(begin, end, ray, plane, x, y, on_way):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        land_batch(v, start, min(BATCH, end - start), ray, plane, x, y, on_way)
-
-
-@njit(entry=True, **FAST)
-def _land(block, ray, plane, x, y, on_way, blocks):
-    """x, y and on_way (N,), from ray: o and d, six components."""
-    if block == ALL:
-        on_threads(blocks, (ray, plane, x, y, on_way, blocks))
-        return
-    count = len(x)
-    _land_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, x, y, on_way)
-
-
-@njit(inline="always", **FAST)
-def pull_batch(v, start, count, ray, plane, given, out):
-    """A batch of `_land_adjoint`."""
-    _, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _ = plane
-    _path(ray, start, count, plane, v)
-    load(given[0], start, count, v[X])
-    load(given[1], start, count, v[Y])
-    for j in range(count):
-        k, x, y = v[K, j], v[X, j], v[Y, j]
-        # x and y
-        rx, ry, rz = x * ax + y * bx, x * ay + y * by, x * az + y * bz
-        # r
-        by_k = rx * v[DX, j] + ry * v[DY, j] + rz * v[DZ, j]
-        # k
-        by_away = by_k * v[OVER, j] if v[ON_WAY, j] > 0.0 else 0.0
-        v[BY_OX, j], v[BY_OY, j], v[BY_OZ, j] = rx - by_away * nx, ry - by_away * ny, rz - by_away * nz
-        v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = k * v[BY_OX, j], k * v[BY_OY, j], k * v[BY_OZ, j]
-    for i in range(6):
-        store(v[BY_OX + i], start, count, out[i])
-
-
-@njit(**FAST)
-def _pull_some(begin, end, ray, plane, given, out):
-    v = np.empty((ROWS, BATCH))
-    for start in range(begin, end, BATCH):
-        pull_batch(v, start, min(BATCH, end - start), ray, plane, given, out)
-
-
-@njit(entry=True, **FAST)
-def _land_adjoint(block, ray, plane, given, out, count, blocks):
-    """Derivatives by the ray's components into `out`, from those by x and y."""
-    if block == ALL:
-        on_threads(blocks, (ray, plane, given, out, count, blocks))
-        return
-    _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, given, out)
-
-
-class _Landing(torch.autograd.Function):
-    """o and d by components, and the plane -> x, y and whether the ray is on its way."""
-
-    @staticmethod
-    def forward(ox, oy, oz, dx, dy, dz, plane: TargetPlane):
-        ray = (ox, oy, oz, dx, dy, dz)
-        count = _count(ray)
-        (x, y), on_way = new(2, count), np.empty(count, np.bool_)
-        _land(ALL, components(ray), plane, x, y, on_way, blocks())
-        return tuple(torch.from_numpy(a) for a in (x, y, on_way))
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        *ray, ctx.plane = inputs
-        ctx.count = _count(ray)
-        keep(ctx, ray)
-        ctx.mark_non_differentiable(output[2])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, by_x, by_y, _):
-        out = wanted(ctx, 6, ctx.count)
-        _land_adjoint(ALL, components(kept(ctx)), ctx.plane, components((by_x, by_y)), out, ctx.count, blocks())
-        return *given(ctx, out), None
-
-
-def _count(ray) -> int:
-    return next(len(c) for c in ray if isinstance(c, Tensor))
+    return on(LAND)(plane, *origin, *direction)

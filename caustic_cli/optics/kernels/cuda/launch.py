@@ -90,6 +90,7 @@ def array(tensor: Tensor):
 def _view(value):
     if isinstance(value, Tensor):
         return array(value.detach())
-    if type(value) is tuple:  # but not a named one, which is of numbers
-        return tuple(_view(v) for v in value)
+    if isinstance(value, tuple):
+        made = map(_view, value)
+        return value._make(made) if hasattr(value, "_make") else tuple(made)
     return value

@@ -24,7 +24,7 @@ from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.launch import device, start
 from caustic_cli.optics.kernels.intersect import HIT
 
-piece, push_powers, value_at = (device(f) for f in (spline.piece, spline.push_powers, intersect._value))
+place, push_powers, value_at = (device(f) for f in (spline.place, spline.push_powers, intersect.value_at))
 first_hit, beyond, pull_alone = device(batches.first_hit), device(batches.beyond), device(batches.pull_alone)
 enter_alone, units = device(ray_intersections.enter_alone), device(sums.units)
 
@@ -75,7 +75,7 @@ class DeviceSurface:
         self.shape = tuple(s.n for s in spaces)
         self.scale = (0.5 / half_size[0], 0.5 / half_size[1])
         self.u, self.v = (PolynomialAxis.of(s, place) for s in spaces)
-        self.geometry = (*self.u[2:], *self.v[2:])
+        self.pieces = spline.Pieces(*self.u[2:], *self.v[2:], *self.scale)
         self.spaces = spaces
         #: d xi / dx and d eta / dy in the narrowest piece, per mm.
         self.steepest = tuple(float(a.inverse.max()) * s for a, s in zip((self.u, self.v), self.scale, strict=True))
@@ -94,15 +94,21 @@ class DeviceSurface:
         along_u = self.v.spread(along_v, self.shape[1]).T.reshape(pieces, order, self.shape[1])
         return self.u.spread(along_u, self.shape[0])
 
-    def pull_points(self, u: Tensor, v: Tensor, where: Tensor, by_z: Tensor, by_x: Tensor, by_y: Tensor) -> Tensor:
-        """Derivatives by the heights (n, m), from those by height and slopes at points in [0, 1]^2 of span products `where` (-1:
-        none), all (N,)."""
+    def evaluate(self, heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """z mm, dz/dx and dz/dy at points in [0, 1]^2, all (N,) float64."""
+        z, zx, zy = (torch.empty_like(u) for _ in range(3))
+        start(_evaluate, len(u), (u, v), self.pieces, self.coefficients(heights.detach().double()), (z, zx, zy))
+        return z, zx, zy
+
+    def pull_at(self, u: Tensor, v: Tensor, by_z: Tensor, by_x: Tensor, by_y: Tensor) -> Tensor:
+        """Adjoint of `evaluate`: derivatives by the heights, (n, m)."""
         steep_x, steep_y = self.steepest
+        by = tuple(b.contiguous() for b in (by_z, by_x, by_y))
         bound = by_z.abs().sum() + steep_x * by_x.abs().sum() + steep_y * by_y.abs().sum()
         unit = sums.unit_of(bound * self.u.largest_power(u) * self.v.largest_power(v))
         shape = (len(self.u.control), len(self.v.control), self.u.control.shape[1], self.v.control.shape[1])
         total = torch.zeros(shape, dtype=torch.int64, device=u.device)
-        start(_pull(*shape[2:]), len(u), (u, v, by_z, by_x, by_y), where, self.geometry, self.scale, unit, total)
+        start(_pull(*shape[2:]), len(u), (u, v, *by), self.pieces, unit, total)
         return self.pull(sums.value_of(total, unit))
 
 
@@ -116,12 +122,11 @@ def surface_of(field, place: torch.device) -> DeviceSurface:
 
 
 @cuda.jit
-def _evaluate(points, geometry, scale, c, out, where):
-    (u, v), (bu, mu, wu, bv, mv, wv), (scale_x, scale_y), (z, zx, zy) = points, geometry, scale, out
+def _evaluate(points, pieces, c, out):
+    (u, v), (z, zx, zy) = points, out
     for k in range(cuda.grid(1), len(u), cuda.gridsize(1)):
-        height, along, across = value_at(c, u[k], v[k], bu, mu, wu, bv, mv, wv)
-        z[k], zx[k], zy[k] = height, along * scale_x, across * scale_y
-        where[k] = piece(u[k], bu) * (len(bv) - 1) + piece(v[k], bv)
+        height, along, across = value_at(c, u[k], v[k], pieces)
+        z[k], zx[k], zy[k] = height, along * pieces.scale_x, across * pieces.scale_y
 
 
 @cache
@@ -129,19 +134,16 @@ def _pull(order_u: int, order_v: int):
     """The adjoint of values and slopes at points, by p + 1 and q + 1."""
 
     @cuda.jit
-    def pull(points, where, geometry, scale, unit, total):
-        (u, v, by_z, by_x, by_y), (_, mu, wu, _, mv, wv), (scale_x, scale_y) = points, geometry, scale
+    def pull(points, pieces, unit, total):
+        (u, v, by_z, by_x, by_y), by_u, by_v = points, pieces.scale_x, pieces.scale_y
         grad, powers = cuda.local.array((1, 1, order_u, order_v), float64), cuda.local.array((2, order_v), float64)
-        wide = len(mv)
         for k in range(cuda.grid(1), len(u), cuda.gridsize(1)):
-            if where[k] < 0:
-                continue
-            i, j = where[k] // wide, where[k] % wide
+            i, j, xi, eta = place(u[k], v[k], pieces)
             for a in range(order_u):
                 for b in range(order_v):
                     grad[0, 0, a, b] = 0.0
-            xi, eta = (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j]
-            push_powers(grad, 0, 0, xi, eta, by_z[k], by_x[k] * wu[i] * scale_x, by_y[k] * wv[j] * scale_y, powers)
+            by_xi, by_eta = by_x[k] * pieces.over_u[i] * by_u, by_y[k] * pieces.over_v[j] * by_v
+            push_powers(grad, 0, 0, xi, eta, by_z[k], by_xi, by_eta, powers)
             for a in range(order_u):
                 for b in range(order_v):
                     cuda.atomic.add(total, (i, j, a, b), units(grad[0, 0, a, b], unit[0]))
@@ -149,85 +151,37 @@ def _pull(order_u: int, order_v: int):
     return pull
 
 
-def surface_at(surface: DeviceSurface, heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Heights (n, m) mm, points in [0, 1]^2 (N,) -> z mm, dz/dx, dz/dy (N,) float64, linear in the heights."""
-    z, zx, zy, _ = _AtPoints.apply(heights, surface, u, v)
-    return z, zx, zy
-
-
-class _AtPoints(torch.autograd.Function):
-    @staticmethod
-    def forward(heights: Tensor, surface: DeviceSurface, u: Tensor, v: Tensor):
-        out, where = tuple(torch.empty_like(u) for _ in range(3)), torch.empty(u.shape, dtype=torch.int64, device=u.device)
-        c = surface.coefficients(heights.detach().double())
-        start(_evaluate, len(u), (u, v), surface.geometry, surface.scale, c, out, where)
-        return *out, where
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        heights, ctx.surface, u, v = inputs
-        ctx.dtype = heights.dtype
-        ctx.save_for_backward(u, v, output[3])
-        ctx.mark_non_differentiable(output[3])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, by_z, by_x, by_y, _):
-        u, v, where = ctx.saved_tensors
-        return ctx.surface.pull_points(u, v, where, *(b.contiguous() for b in (by_z, by_x, by_y))).to(ctx.dtype), None, None, None
-
-
 # Ray intersections.
 
 
 @cuda.jit
-def _first_hits(rays, bounds, radius, geometry, scale, c, out, where):
-    ox, oy, oz, dx, dy, dz = rays
-    (bu, mu, wu, bv, mv, wv), (scale_x, scale_y), (t, gx, gy) = geometry, scale, out
+def _first_hits(rays, bounds, radius, pieces, c, out, where):
+    (ox, oy, oz, dx, dy, dz), (t, gx, gy), scale_x, scale_y = rays, out, pieces.scale_x, pieces.scale_y
     low, high, slope_u, slope_v, floor = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     for k in range(cuda.grid(1), len(t), cuda.gridsize(1)):
         du, dv = dx[k] * scale_x, dy[k] * scale_y
-        ray = (ox[k] * scale_x + 0.5, oy[k] * scale_y + 0.5, oz[k], du, dv, dz[k])
-        ou, ov, up, way = enter_alone(ray, floor)
-        status, here, reach, zx, zy = first_hit(
-            (ou, ov, up, du, dv, dz[k]), (low, high), (slope_u, slope_v), c, bu, mu, wu, bv, mv, wv, scale_x, scale_y
-        )
-        found = status == HIT and way + reach > 0.0 and not beyond(ou, ov, du, dv, reach, radius, scale_x, scale_y)
+        ou, ov, up, way = enter_alone((ox[k] * scale_x + 0.5, oy[k] * scale_y + 0.5, oz[k], du, dv, dz[k]), floor)
+        status, here, reach, zx, zy = first_hit((ou, ov, up, du, dv, dz[k]), (low, high), (slope_u, slope_v), c, pieces)
+        found = status == HIT and way + reach > 0.0 and not beyond(ou, ov, du, dv, reach, radius, pieces)
         t[k], gx[k], gy[k] = (way + reach, zx, zy) if found else (0.0, 0.0, 0.0)
         where[k] = here if found else -1
 
 
 @cuda.jit
-def _pull_rays(rays, found, where, given, geometry, scale, c, out):
+def _pull_rays(rays, found, where, given, pieces, c, out):
     """X + L_Z Z_x, Y + L_Z Z_y and L_Z in `out`, and u and v of the intersections."""
     (ox, oy, dx, dy, dz), (t, gx, gy), (by_t, by_gx, by_gy) = rays, found, given
-    (_, mu, wu, _, mv, wv), (scale_x, scale_y), (by_x, by_y, by_z, u, v) = geometry, scale, out
+    (_, mu, wu, _, mv, wv, scale_x, scale_y), (by_x, by_y, by_z, u, v) = pieces, out
     wide = len(mv)
     for k in range(cuda.grid(1), len(t), cuda.gridsize(1)):
         by_x[k], by_y[k], by_z[k], u[k], v[k] = 0.0, 0.0, 0.0, 0.5, 0.5
         if where[k] < 0:
             continue
         i, j = where[k] // wide, where[k] % wide
-        du, dv = dx[k] * scale_x, dy[k] * scale_y
-        u[k], v[k] = ox[k] * scale_x + 0.5 + t[k] * du, oy[k] * scale_y + 0.5 + t[k] * dv
-        xi, eta = (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j]
-        along, across, up = pull_alone(
-            c,
-            i,
-            j,
-            xi,
-            eta,
-            wu[i],
-            wv[j],
-            by_t[k],
-            by_gx[k] * scale_x,
-            by_gy[k] * scale_y,
-            (du, dv, dz[k]),
-            gx[k],
-            gy[k],
-            scale_x,
-            scale_y,
-        )
+        d = (dx[k] * scale_x, dy[k] * scale_y, dz[k])
+        u[k], v[k] = ox[k] * scale_x + 0.5 + t[k] * d[0], oy[k] * scale_y + 0.5 + t[k] * d[1]
+        xi, eta, by_u, by_v = (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j], by_gx[k] * scale_x, by_gy[k] * scale_y
+        along, across, up = pull_alone(c, i, j, xi, eta, by_t[k], by_u, by_v, d, gx[k], gy[k], pieces)
         by_x[k], by_y[k], by_z[k] = along * scale_x + up * gx[k], across * scale_y + up * gy[k], up
 
 
@@ -236,11 +190,11 @@ def hits_of_rays(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`kernels.ray_intersections.hits_of_rays` of a rectangle: t, dz/dx, dz/dy and found, (N,) each."""
     limit = torch.inf if radius is None else float(radius)
-    if side > 0:
-        return _Hits.apply(heights, *origin, *direction, surface, limit)[:4]
     (ox, oy, oz), (dx, dy, dz) = origin, direction
-    t, gx, gy, found, _ = _Hits.apply(-heights, ox, oy, -oz, dx, dy, -dz, surface, limit)
-    return t, -gx, -gy, found
+    if side < 0:
+        heights, oz, dz = -heights, -oz, -dz
+    t, gx, gy, found, _ = _Hits.apply(heights, ox, oy, oz, dx, dy, dz, surface, limit)
+    return (t, -gx, -gy, found) if side < 0 else (t, gx, gy, found)
 
 
 def _sag(heights: Tensor) -> tuple[Tensor, Tensor]:
@@ -267,7 +221,7 @@ class _Hits(torch.autograd.Function):
         rays = tuple(c.detach().contiguous() for c in (ox, oy, oz - middle, dx, dy, dz))
         out, where = tuple(torch.empty_like(ox) for _ in range(3)), torch.empty(ox.shape, dtype=torch.int64, device=ox.device)
         bounds, c = _bounds(surface, h), surface.coefficients(h)
-        start(_first_hits, len(ox), rays, bounds, radius, surface.geometry, surface.scale, c, out, where)
+        start(_first_hits, len(ox), rays, bounds, radius, surface.pieces, c, out, where)
         return *out, where >= 0, where
 
     @staticmethod
@@ -281,13 +235,13 @@ class _Hits(torch.autograd.Function):
     def backward(ctx, *by):
         heights, ox, oy, _, dx, dy, dz, t, gx, gy, _, where = ctx.saved_tensors
         surface, wanted = ctx.surface, ctx.needs_input_grad
-        found = tuple(a.detach() for a in (t, gx, gy))
+        found, none = tuple(a.detach() for a in (t, gx, gy)), torch.zeros((), dtype=t.dtype, device=t.device)
         c = surface.coefficients(_sag(heights)[0])
         out = tuple(torch.empty_like(t) for _ in range(5))
-        rays, given = _whole((ox, oy, dx, dy, dz)), _whole(by[:3])
-        start(_pull_rays, len(t), rays, found, where, given, surface.geometry, surface.scale, c, out)
+        rays, given = _whole((ox, oy, dx, dy, dz)), _whole(torch.where(where >= 0, b, none) for b in by[:3])
+        start(_pull_rays, len(t), rays, found, where, given, surface.pieces, c, out)
         by_x, by_y, by_z, u, v = out
-        net = surface.pull_points(u, v, where, by_z, *given[1:]).to(heights.dtype) if wanted[0] else None
+        net = surface.pull_at(u, v, by_z, *given[1:]).to(heights.dtype) if wanted[0] else None
         starts = (by_x, by_y, -by_z)
         return (
             net,
