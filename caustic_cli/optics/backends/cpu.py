@@ -17,10 +17,9 @@ from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.gradient.fields import LEAST_SQUARE, SplineIndex
 from caustic_cli.optics.gradient.integrator import WEIGHTS, Flow
 from caustic_cli.optics.interface import OutgoingRays
-from caustic_cli.optics.kernels import fused, fused_functions
+from caustic_cli.optics.kernels import fused_functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
-from caustic_cli.optics.kernels.pencil import PencilKernel
 from caustic_cli.optics.kernels.polynomial_index import formula_flow
 from caustic_cli.optics.kernels.ray_intersections import RayIntersections, hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
@@ -219,7 +218,7 @@ class PencilImage:
         self.interface, s, self.emitted = interface, pencil.sample, pencil.emitted
         #: Power through the pupil, and less what the entrance reflects, ().
         self.entering, self.passed = pencil.entering(*entrance)
-        self.kernel: PencilKernel = PencilKernel(
+        self.kernel: fused_functions.PencilKernel = fused_functions.PencilKernel(
             field.spaces,
             field.half_size,
             s.u,
@@ -236,14 +235,12 @@ class PencilImage:
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
         """Image, power that leaves the surface, and what was lost since the source; what misses the surface is the rest."""
         reference = float(heights.detach().mean())
-        image, leaving, ledger = self.kernel(heights - reference, *self.interface, reference, screen, filter)
-        met = ledger[[fused.LEAVING, fused.FRESNEL, fused.REFLECTED]].sum()
-        lost = {
+        image, leaving, lost = self.kernel(heights - reference, *self.interface, reference, screen, filter)
+        met = leaving.detach() + lost["fresnel"] + lost["total_internal_reflection"]
+        lost |= {
             "missed_lens": self.emitted - self.entering,
             "missed_surface": self.passed - met,
-            "fresnel": self.entering - self.passed + ledger[fused.FRESNEL],
-            "total_internal_reflection": ledger[fused.REFLECTED],
-            "off_screen": ledger[fused.OFF_SCREEN],
+            "fresnel": self.entering - self.passed + lost["fresnel"],
         }
         return image, leaving, lost
 

@@ -44,6 +44,22 @@ class ScreenFrame(NamedTuple):
         return cls(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
 
 
+class Point(NamedTuple):
+    """A source point behind the flat entrance, for the rays of `pencil`.
+
+    x, y: mm; distance: h, mm; index: n of the entrance; steps: of Newton's iteration; scale: 2 / largest s; emission: coefficients
+    of J, the highest first; see `optics.pencil`.
+    """
+
+    x: float
+    y: float
+    distance: float
+    index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
+    steps: int
+    scale: float
+    emission: np.ndarray
+
+
 class Splat(NamedTuple):
     """The reconstruction filter: its kind, as in `filter_weights`, sizes in pixels (odd), and alpha, per pixel squared."""
 

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.spline import piece
+from caustic_cli.optics.kernels.spline import place
 from caustic_cli.optics.kernels.surface import FusedSurface
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.surfaces import HeightField
@@ -147,19 +147,19 @@ def weigh(block, field, widened, rows, blocks):
 
 
 @njit(entry=True, **FAST)
-def displace(block, u, v, c, pu, pv, bu, mu, wu, bv, mv, wv, weight, out, blocks):
+def displace(block, u, v, c, pu, pv, pieces, weight, out, blocks):
     """A weight times a height field at points (u, v) of [0, 1]^2, (n, m) -> out (n, m).
 
     c: coefficients as of `spline`, (I, J, (p + 1) (q + 1)); pu, pv: tuples of p + 1 and q + 1 numbers, of known lengths.
     """
     if block == ALL:
-        on_threads(blocks, (u, v, c, pu, pv, bu, mu, wu, bv, mv, wv, weight, out, blocks))
+        on_threads(blocks, (u, v, c, pu, pv, pieces, weight, out, blocks))
         return
     n, m = u.shape
     for k in range(block * n // blocks, (block + 1) * n // blocks):
         for s in range(m):
-            i, j = piece(u[k, s], bu), piece(v[k, s], bv)
-            xi, eta, local, z = (u[k, s] - mu[i]) * wu[i], (v[k, s] - mv[j]) * wv[j], c[i, j], 0.0
+            i, j, xi, eta = place(u[k, s], v[k, s], pieces)
+            local, z = c[i, j], 0.0
             for a in range(len(pu) - 1, -1, -1):
                 row = 0.0
                 for b in range(len(pv) - 1, -1, -1):
@@ -169,18 +169,17 @@ def displace(block, u, v, c, pu, pv, bu, mu, wu, bv, mv, wv, weight, out, blocks
 
 
 @njit(entry=True, **FAST)
-def pull_displacement(block, u, v, by, pu, pv, bu, mu, wu, bv, mv, wv, weight, grads):
+def pull_displacement(block, u, v, by, pu, pv, pieces, weight, grads):
     """Adjoint of `displace`: derivatives by the coefficients into grads (blocks, I, J, (p + 1) (q + 1)), overwritten."""
     if block == ALL:
-        on_threads(len(grads), (u, v, by, pu, pv, bu, mu, wu, bv, mv, wv, weight, grads))
+        on_threads(len(grads), (u, v, by, pu, pv, pieces, weight, grads))
         return
     (n, m), blocks, grad = u.shape, len(grads), grads[block]
     grad[:] = 0.0
     for k in range(block * n // blocks, (block + 1) * n // blocks):
         for s in range(m):
-            i, j = piece(u[k, s], bu), piece(v[k, s], bv)
-            xi, eta, local = (u[k, s] - mu[i]) * wu[i], (v[k, s] - mv[j]) * wv[j], grad[i, j]
-            along = by[k, s] * weight[k, s]
+            i, j, xi, eta = place(u[k, s], v[k, s], pieces)
+            local, along = grad[i, j], by[k, s] * weight[k, s]
             for a in range(len(pu)):
                 term = along
                 for b in range(len(pv)):
@@ -265,7 +264,7 @@ class FusedPathChange(PathChange):
             *self.points,
             self._flat(self.spline.coefficients(heights)),
             *self.orders,
-            *self.spline.geometry,
+            self.spline.pieces,
             self.weight,
             out.numpy(),
             blocks(),
@@ -275,7 +274,7 @@ class FusedPathChange(PathChange):
     def pull(self, by: Tensor) -> Tensor:
         """As the reference."""
         grads = self.spline.workspace()
-        pull_displacement(ALL, *self.points, by.numpy(), *self.orders, *self.spline.geometry, self.weight, self._flat(grads))
+        pull_displacement(ALL, *self.points, by.numpy(), *self.orders, self.spline.pieces, self.weight, self._flat(grads))
         return self.spline.pull(grads)
 
     @staticmethod

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks, fused, pixels, random_points
-from caustic_cli.optics.kernels.arguments import Exit, RowsOfRays, RowsOfSurface, ScreenFrame, Splat
+from caustic_cli.optics.kernels.arguments import Exit, Point, RowsOfRays, RowsOfSurface, ScreenFrame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.fresnel import FRESNEL
 from caustic_cli.optics.kernels.ray_intersections import RayIntersections
@@ -59,12 +59,8 @@ class PlaneKernel:
         self.tensor, self.v = tensor, v
         self.workspace: _Workspace = _Workspace() if like is None else like.workspace
         if tensor:
-            self.first, bu = su.basis(u)
-            self.bu, self.du = bu.contiguous(), (su.basis(u, 1)[1] / (2.0 * rx)).contiguous()
-            if like is not None and like.v is v:
-                self.along_v: AlongV = like.along_v
-            else:
-                self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry))
+            self.rows = _rows(su, u, rx)
+            self.along_v: AlongV = like.along_v if like is not None and like.v is v else AlongV(sv, v, 1.0 / (2.0 * ry))
             x, y, shape = u[:, None], v[None, :], (len(u), len(v))
         else:
             shape = _layout(len(u))
@@ -72,8 +68,7 @@ class PlaneKernel:
             if short:
                 power = torch.nn.functional.pad(power.expand(len(u)), (0, short))
                 u, v = (torch.nn.functional.pad(t, (0, short), value=0.5) for t in (u, v))
-            self.first = torch.arange(shape[0])
-            self.bu = self.du = torch.ones(shape[0], 1, dtype=torch.float64)
+            self.rows = np.arange(shape[0]), np.ones((shape[0], 1)), np.ones((shape[0], 1))
             self.points = (u.numpy(), v.numpy())
             self.surface: FusedSurface = FusedSurface(spaces, half_size) if like is None else like.surface
             x, y, power = u.view(shape), v.view(shape), power.view(shape) if power.ndim else power
@@ -81,7 +76,6 @@ class PlaneKernel:
         coordinates = ((2.0 * x - 1.0) * rx, (2.0 * y - 1.0) * ry, power)
         own_x, own_y, flux = (_strided(np.broadcast_to(t.double().numpy(), shape)) for t in coordinates)
         self.rays = RowsOfRays(own_x, own_y, _NONE, _NONE, flux)
-        self.rows = (self.first.numpy(), self.bu.numpy(), self.du.numpy())
 
     def __call__(self, sag: Tensor, eta: float, fresnel: str, height: float, screen: Screen, filter: Filter):
         """Control heights (n, m) float64 relative to some plane, mm, and the screen's height above it, mm: see `_splat`."""
@@ -128,6 +122,76 @@ class RayKernel:
         return _splat(nets, self.rows, True, self.rays, (eta, fresnel), heights_of, screen, filter, self.workspace)
 
 
+class PencilKernel:
+    """The fused form of `optics.pencil`, `interface.interact`, landing and `reconstruction.splat`.
+
+    Args:
+        spaces, half_size: of the height field; half widths in mm.
+        u, v: parameters of the points, which are all pairs of them; area: of the aperture for each, mm^2, scalar or (a, b).
+        place: (x, y) of the source, mm; distance: of it from the entrance, which lies at z_in, mm; index: n of the entrance.
+        emission: J, by `pencil.polynomial`, and the largest s.
+        like: the kernel of another chunk, whose basis values along v serve again where v is the same tensor, with its workspace.
+    """
+
+    def __init__(
+        self,
+        spaces,
+        half_size,
+        u: Tensor,
+        v: Tensor,
+        area: Tensor,
+        place: tuple[float, float],
+        distance: float,
+        z_in: float,
+        index: float,
+        emission: tuple[np.ndarray, float],
+        like: PencilKernel | None = None,
+    ):
+        (su, sv), (rx, ry) = spaces, half_size
+        self.v, self.rows = v, _rows(su, u, rx)
+        self.along_v: AlongV = like.along_v if like is not None and like.v is v else AlongV(sv, v, 1.0 / (2.0 * ry))
+        self.workspace: _Workspace = _Workspace() if like is None else like.workspace
+        x, y = ((2.0 * c - 1.0) * r - p for c, r, p in zip((u, v), half_size, place, strict=True))
+        at = (_strided(np.broadcast_to(c.double().numpy(), (len(u), len(v)))) for c in (x[:, None], y[None, :], area))
+        own_x, own_y, areas = at
+        self.rays = RowsOfRays(own_x, own_y, _NONE, _NONE, areas)
+        (self.coefficients, most), self.place, self.distance, self.z_in, self.index = emission, place, distance, z_in, index
+        self.scale = 2.0 / most
+        self.reach2 = float(x.abs().max() ** 2 + y.abs().max() ** 2)
+
+    def steps(self, thickest: float) -> int:
+        """Newton steps after which u is exact to rounding for any point at most `thickest` mm behind the entrance."""
+        q, z = (c.ravel() for c in np.meshgrid(np.linspace(0.0, self.reach2, 65), np.linspace(0.0, max(thickest, 0.0), 9)))
+        n, h = self.index, self.distance
+        u, steps = n / (n * h + z), 0
+        while True:
+            c = 1.0 / np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * u * u)
+            step = (u * (h + z * c) - 1.0) / (h + z * n * n * c**3)
+            if steps == MOST_STEPS or np.abs(step / u).max() < EXACT:
+                return steps
+            u, steps = u - step, steps + 1
+
+    def __call__(self, sag: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
+        """Control heights (n, m) float64 relative to `reference`, mm: see `_splat`."""
+        steps = self.steps(float(sag.detach().max()) + reference - self.z_in)
+        point = Point(
+            float(self.place[0]),
+            float(self.place[1]),
+            float(self.distance),
+            float(self.index),
+            steps,
+            self.scale,
+            self.coefficients,
+        )
+        net, net_y = self.along_v(sag)
+        ends = self.z_in - reference, screen.z - reference
+        return _splat((net, net, net_y), self.rows, False, self.rays, (eta, fresnel), ends, screen, filter, self.workspace, point)
+
+
+#: Largest number of Newton steps, and the relative size of a step that is not taken, since the next would be its square.
+MOST_STEPS, EXACT = 30, 1e-13
+
+
 def _splat(
     nets,
     rows,
@@ -138,14 +202,15 @@ def _splat(
     screen: Screen,
     filter: Filter,
     workspace: _Workspace,
+    point: Point | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; ends: heights of oblique rays' origins
-    and of the screen, mm.
+    and of the screen, mm; point: of rays from one.
 
     Returns:
         image (n_x, n_y) and the power behind the lens (), float64, differentiable; losses by name.
     """
-    arguments = _arguments(rays, interface, ends, screen, filter)
+    arguments = _arguments(rays, interface, ends, screen, filter, point)
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
     image, beside = trimmed(padded, screen, filter)
     lost = {"missed_surface": ledger[fused.MISSED]} if rays.along_x is not _NONE else {}
@@ -153,11 +218,24 @@ def _splat(
     return image, leaving, lost | {"off_screen": ledger[fused.OFF_SCREEN] + beside.detach()}
 
 
-def _arguments(rays: RowsOfRays, interface: tuple[float, str], ends: tuple[float, float], screen: Screen, filter: Filter) -> tuple:
+def _rows(space: SplineSpace, u: Tensor, half: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The first three of `RowsOfSurface` for points u, of a surface of this half width, mm."""
+    first, values = space.basis(u)
+    return first.numpy(), values.contiguous().numpy(), (space.basis(u, 1)[1] / (2.0 * half)).contiguous().numpy()
+
+
+def _arguments(
+    rays: RowsOfRays,
+    interface: tuple[float, str],
+    ends: tuple[float, float],
+    screen: Screen,
+    filter: Filter,
+    point: Point | None = None,
+) -> tuple:
     """The arguments of the `fused` kernels after the surface."""
     eta, fresnel = interface
     exit_ = Exit(float(eta), FRESNEL[fresnel], *map(float, ends))
-    return rays, exit_, ScreenFrame.of(screen), Splat.of(filter), None if rays.along_x is _NONE else True
+    return rays, exit_, ScreenFrame.of(screen), Splat.of(filter), None if rays.along_x is _NONE else True, point
 
 
 def _layout(count: int) -> tuple[int, int]:
@@ -248,7 +326,7 @@ def _adjoint(
 
 def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Images and scratch of all blocks, to be overwritten."""
-    rays, _, frame, splat, _ = arguments
+    rays, _, frame, splat, *_ = arguments
     count = blocks()
     images = workspace("images", count, *splat.padded(frame))
     return images, workspace("scratch", count, fused.scratch_rows(splat), rays.x.shape[1])

@@ -13,61 +13,17 @@ and the ray leaves along n D + Gamma N, here with n the ratio of the indices at 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from caustic_cli.optics.kernels import filter_weights, fused, pixels
-from caustic_cli.optics.kernels.arguments import Exit, ScreenFrame, Splat
-from caustic_cli.optics.kernels.axial_refraction import (
-    BY_GX,
-    BY_GY,
-    BY_POWER,
-    BY_PX,
-    BY_PY,
-    BY_SAG,
-    FLUX,
-    FRESNEL,
-    GX,
-    GY,
-    POWER,
-    PX,
-    PY,
-    SAG,
-    X,
-    load,
-)
-from caustic_cli.optics.kernels.banded import AlongV
-from caustic_cli.optics.kernels.fused import COLUMNS, _cut, _scatter, gather, share
-from caustic_cli.optics.kernels.fused_functions import _images, _strided, _Workspace
+from caustic_cli.optics.kernels import rows
+from caustic_cli.optics.kernels.fresnel import reflectance
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.oblique_refraction import REFLECTED_POWER, _copy, _put, _reflected
-from caustic_cli.optics.kernels.rows import combine, spread
-from caustic_cli.optics.kernels.stage import BATCH
-from caustic_cli.optics.kernels.threads import ALL, on_threads
-from caustic_cli.optics.reconstruction import Filter, padding
+from caustic_cli.optics.kernels.stage import BATCH, load, store
 from caustic_cli.optics.tolerances import CRITICAL, PARALLEL
-from caustic_cli.scene import Screen
 
 # Rows of a batch's scratch: the surface, cell areas, Y, u, the emission J and its derivative by s, outputs and derivatives by them.
 Z, ZX, ZY, AREA, Y, U, AT, J, J_S, OUT_FLUX, OUT_POWER, OUT_PX, OUT_PY, OUT_Z, OUT_ZX, OUT_ZY, ROWS = range(17)
-
-
-class Point(NamedTuple):
-    """The source point behind the flat entrance.
-
-    x, y: mm; distance: h, mm; index: n of the entrance; steps: of Newton's iteration; scale: 2 / largest s, see `optics.pencil`.
-    """
-
-    x: float
-    y: float
-    distance: float
-    index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
-    steps: int
-    scale: float
 
 
 @njit(inline="always", **FAST)
@@ -125,44 +81,48 @@ def _aim(w, count, x, point, exit_, frame):
     over_x, over_y = 1.0 / frame.pixel_x, 1.0 / frame.pixel_y
     for j in range(count):
         _, _, _, by_u, k, long2, m, norm2, s, passes = _bend(w, j, x, depth, point, n)
-        reflected, _, _, _ = _reflected(fresnel, m, s, norm2 * long2, n)
+        reflected, _, _, _, _ = reflectance(fresnel, n, norm2 * long2, m, s, 0.5)
         flux = w[AREA, j] * w[J, j] * w[U, j] / by_u * max(m, 0.0)  # none arrives from above the surface
         gamma = (1.0 - n) * (1.0 + n) * long2 / (s + n * m)
         down = n + gamma
         path = (height - w[Z, j]) / down
-        power = flux * (1.0 - reflected) if passes else REFLECTED_POWER
+        power = flux * (1.0 - reflected) if passes else rows.REFLECTED_POWER
         w[OUT_FLUX, j] = flux
         w[OUT_POWER, j] = power if m > 0.0 else 0.0
         px = (point.x + x + path * (n * k * x - gamma * w[ZX, j]) - frame.low_x) * over_x
-        w[OUT_PX, j] = px if down > PARALLEL else math.nan  # never arrives
+        w[OUT_PX, j] = px if down > PARALLEL else rows.BESIDE
         w[OUT_PY, j] = (point.y + w[Y, j] + path * (n * k * w[Y, j] - gamma * w[ZY, j]) - frame.low_y) * over_y
 
 
 @njit(inline="always", **FAST)
-def _take(w, v, start, count, y, area):
-    """A batch of the surface, Y and cell areas."""
-    _copy(v[SAG], start, count, w[Z])
-    _copy(v[GX], start, count, w[ZX])
-    _copy(v[GY], start, count, w[ZY])
-    _copy(y, start, count, w[Y])
-    load(area[start : start + count], w[AREA][:count])
+def _take(w, v, start, count, i, rays):
+    """A batch of the surface, Y and cell areas of row i."""
+    load(v[rows.SAG], start, count, w[Z])
+    load(v[rows.GX], start, count, w[ZX])
+    load(v[rows.GY], start, count, w[ZY])
+    rows.load(rays.y[i][start : start + count], w[Y][:count])
+    rows.load(rays.flux[i][start : start + count], w[AREA][:count])
 
 
 @njit(**FAST)
-def aim(v, x, y, area, point, emission, exit_, frame):
-    """Flux in front of the exit, power behind it and landing points in pixels of a row of rays, from SAG, GX, GY; u into X."""
-    w = np.empty((ROWS, BATCH))
-    for start in range(0, len(y), BATCH):
-        count = min(BATCH, len(y) - start)
-        _take(w, v, start, count, y, area)
+def aim(v, i, rays, exit_, frame, point):
+    """Flux in front of the exit, power behind it and landing points in pixels of row i of rays, from SAG, GX, GY; u into X.
+
+    rays: points (x, y), mm from the source's projection, each for an area in place of a flux, mm^2; exit_: `start` is the height of
+    the entrance.
+    """
+    w, x = np.empty((ROWS, BATCH)), rays.x[i, 0]
+    for start in range(0, v.shape[1], BATCH):
+        count = min(BATCH, v.shape[1] - start)
+        _take(w, v, start, count, i, rays)
         _cross(w, count, x, -exit_.start, point)
-        _emit(w, count, x, point, emission)
+        _emit(w, count, x, point, point.emission)
         _aim(w, count, x, point, exit_, frame)
-        _put(w[U], start, count, v[X])
-        _put(w[OUT_FLUX], start, count, v[FLUX])
-        _put(w[OUT_POWER], start, count, v[POWER])
-        _put(w[OUT_PX], start, count, v[PX])
-        _put(w[OUT_PY], start, count, v[PY])
+        store(w[U], start, count, v[rows.X])
+        store(w[OUT_FLUX], start, count, v[rows.FLUX])
+        store(w[OUT_POWER], start, count, v[rows.POWER])
+        store(w[OUT_PX], start, count, v[rows.PX])
+        store(w[OUT_PY], start, count, v[rows.PY])
 
 
 @njit(inline="always", **FAST)
@@ -171,7 +131,7 @@ def _pull(w, count, x, point, exit_):
     for j in range(count):
         y, zx, zy, u = w[Y, j], w[ZX, j], w[ZY, j], w[U, j]
         q, z, c, by_u, k, long2, m, norm2, s, passes = _bend(w, j, x, depth, point, n)
-        reflected, r_m, r_s, r_norm2 = _reflected(fresnel, m, s, norm2 * long2, n)
+        reflected, r_m, r_s, r_norm2, _ = reflectance(fresnel, n, norm2 * long2, m, s, 0.5)
         density = w[AREA, j] * w[J, j] * u / by_u
         by_power, by_x, by_y = w[OUT_POWER, j], w[OUT_PX, j], w[OUT_PY, j]
         # power = density M (1 - R)
@@ -211,167 +171,18 @@ def _pull(w, count, x, point, exit_):
 
 
 @njit(**FAST)
-def pull(v, x, y, area, point, emission, exit_):
+def pull(v, i, rays, exit_, point):
     """Adjoint of `aim`: derivatives by height and slopes, in BY_SAG, BY_GX, BY_GY.  BY_PX, BY_PY: per mm."""
-    w = np.empty((ROWS, BATCH))
-    for start in range(0, len(y), BATCH):
-        count = min(BATCH, len(y) - start)
-        _take(w, v, start, count, y, area)
-        _copy(v[X], start, count, w[U])
-        _emit(w, count, x, point, emission)
-        _copy(v[BY_POWER], start, count, w[OUT_POWER])
-        _copy(v[BY_PX], start, count, w[OUT_PX])
-        _copy(v[BY_PY], start, count, w[OUT_PY])
+    w, x = np.empty((ROWS, BATCH)), rays.x[i, 0]
+    for start in range(0, v.shape[1], BATCH):
+        count = min(BATCH, v.shape[1] - start)
+        _take(w, v, start, count, i, rays)
+        load(v[rows.X], start, count, w[U])
+        _emit(w, count, x, point, point.emission)
+        load(v[rows.BY_POWER], start, count, w[OUT_POWER])
+        load(v[rows.BY_PX], start, count, w[OUT_PX])
+        load(v[rows.BY_PY], start, count, w[OUT_PY])
         _pull(w, count, x, point, exit_)
-        _put(w[OUT_Z], start, count, v[BY_SAG])
-        _put(w[OUT_ZX], start, count, v[BY_GX])
-        _put(w[OUT_ZY], start, count, v[BY_GY])
-
-
-@njit(entry=True, **FAST)
-def forward(block, images, ledgers, scratch, first, bu, du, net, net_y, x, y, area, point, emission, exit_, frame, splat):
-    """As `fused.forward`, of points (x, y), mm from the source's projection, (a,) and (b,), each for an area (a, b), mm^2.
-
-    emission: coefficients of J, the highest first; exit_: `start` is the height of the entrance.
-    """
-    if block == ALL:
-        arguments = (images, ledgers, scratch, first, bu, du, net, net_y, x, y, area, point, emission, exit_, frame, splat)
-        on_threads(len(images), arguments)
-        return
-    rows, blocks = len(x), len(images)
-    images[block] = 0.0
-    ledgers[block] = 0.0
-    v, sx, sy, dx, dy = _cut(scratch[block], splat.size_x, splat.size_y)
-    column = np.zeros(splat.size_y + -splat.size_y % 4)
-    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        combine(i, first, bu, du, net, net, net_y, v[SAG], v[GX], v[GY])
-        aim(v, x[i], y, area[i], point, emission, exit_, frame)
-        share(v, splat, sx, sy, dx[:0], dy[:0])
-        _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
-
-
-@njit(entry=True, **FAST)
-def backward(block, grad, grad_leaving, nets, scratch, first, bu, du, net, net_y, x, y, area, point, emission, exit_, frame, splat):
-    """Adjoint of `forward`: derivatives by net and net_y in nets[0] and nets[2], as of `fused.backward`."""
-    if block == ALL:
-        arguments = (grad, grad_leaving, nets, scratch, first, bu, du, net, net_y, x, y, area, point, emission, exit_, frame, splat)
-        on_threads(len(scratch), arguments)
-        return
-    rows, blocks = len(x), len(scratch)
-    nets[:, block] = 0.0
-    v, sx, sy, dx, dy = _cut(scratch[block], splat.size_x, splat.size_y)
-    column, tilt = np.zeros(splat.size_y + -splat.size_y % 4), np.zeros(splat.size_y + -splat.size_y % 4)
-    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        combine(i, first, bu, du, net, net, net_y, v[SAG], v[GX], v[GY])
-        aim(v, x[i], y, area[i], point, emission, exit_, frame)
-        share(v, splat, sx, sy, dx, dy)
-        gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
-        pull(v, x[i], y, area[i], point, emission, exit_)
-        spread(i, first, bu, du, v[BY_SAG], v[BY_GX], v[BY_GY], nets[:, block], False)
-
-
-class PencilKernel:
-    """The fused form of `optics.pencil`, `interface.interact`, landing and `reconstruction.splat`.
-
-    Args:
-        spaces, half_size: of the height field; half widths in mm.
-        u, v: parameters of the points, which are all pairs of them; area: of the aperture for each, mm^2, scalar or (a, b).
-        place: (x, y) of the source, mm; distance: of it from the entrance, which lies at z_in, mm; index: n of the entrance.
-        emission: J, by `pencil.polynomial`, and the largest s.
-        like: the kernel of another chunk, whose basis values along v serve again where v is the same tensor, with its workspace.
-    """
-
-    def __init__(
-        self,
-        spaces,
-        half_size,
-        u: Tensor,
-        v: Tensor,
-        area: Tensor,
-        place: tuple[float, float],
-        distance: float,
-        z_in: float,
-        index: float,
-        emission: tuple[np.ndarray, float],
-        like: PencilKernel | None = None,
-    ):
-        (su, sv), (rx, ry) = spaces, half_size
-        first, bu = su.basis(u)
-        self.rows = first.numpy(), bu.contiguous().numpy(), (su.basis(u, 1)[1] / (2.0 * rx)).contiguous().numpy()
-        self.v = v
-        self.along_v: AlongV = like.along_v if like is not None and like.v is v else AlongV(sv, v, 1.0 / (2.0 * ry))
-        self.workspace: _Workspace = _Workspace() if like is None else like.workspace
-        x, y = ((2.0 * c - 1.0) * r - p for c, r, p in zip((u, v), half_size, place, strict=True))
-        areas = _strided(np.broadcast_to(area.double().numpy(), (len(u), len(v))))
-        self.points = x.double().contiguous().numpy(), y.double().contiguous().numpy(), areas
-        (self.coefficients, most), self.place, self.distance, self.z_in, self.index = emission, place, distance, z_in, index
-        self.scale = 2.0 / most
-        self.reach2 = float(np.abs(self.points[0]).max() ** 2 + np.abs(self.points[1]).max() ** 2)
-
-    def steps(self, thickest: float) -> int:
-        """Newton steps after which u is exact to rounding for any point at most `thickest` mm behind the entrance."""
-        q, z = (c.ravel() for c in np.meshgrid(np.linspace(0.0, self.reach2, 65), np.linspace(0.0, max(thickest, 0.0), 9)))
-        n, h = self.index, self.distance
-        u, steps = n / (n * h + z), 0
-        while True:
-            c = 1.0 / np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * u * u)
-            step = (u * (h + z * c) - 1.0) / (h + z * n * n * c**3)
-            if steps == MOST_STEPS or np.abs(step / u).max() < EXACT:
-                return steps
-            u, steps = u - step, steps + 1
-
-    def __call__(self, sag: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
-        """Control heights (n, m) float64 relative to `reference`, mm -> padded image, power behind the lens, ledger.
-
-        Returns:
-            image (n_x, n_y) and power (), float64, differentiable; ledger of `fused`.
-        """
-        thickest = float(sag.detach().max()) + reference - self.z_in
-        (x, y), steps = self.place, self.steps(thickest)
-        point = Point(float(x), float(y), self.distance, float(self.index), steps, self.scale)
-        exit_ = Exit(float(eta), FRESNEL[fresnel], float(self.z_in - reference), float(screen.z - reference))
-        frame = ScreenFrame(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
-        splat = Splat(filter_weights.KINDS[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
-        arguments = (*self.points, point, self.coefficients, exit_, frame, splat)
-        padded, leaving, ledger = _Image.apply(*self.along_v(sag), self.rows, arguments, self.workspace)
-        (nx, ny), (rx, ry) = screen.resolution, filter.reach
-        padded = padded[:, : ny + 4 * ry]
-        ledger[fused.OFF_SCREEN] += padding(padded.detach(), filter.reach)
-        return padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny], leaving, ledger
-
-
-#: Largest number of Newton steps, and the relative size of a step that is not taken, since the next would be its square.
-MOST_STEPS, EXACT = 30, 1e-13
-
-
-class _Image(torch.autograd.Function):
-    """The two nets (n, b) and the arguments of `forward` -> padded image, power behind the lens (), ledger."""
-
-    @staticmethod
-    def forward(net: Tensor, net_y: Tensor, rows: tuple, arguments: tuple, workspace: _Workspace):
-        images, scratch = _blocks(arguments, workspace)
-        ledgers = np.empty((len(images), COLUMNS))
-        forward(ALL, images, ledgers, scratch, *rows, *(t.detach().contiguous().numpy() for t in (net, net_y)), *arguments)
-        ledger = torch.from_numpy(ledgers.sum(0))
-        return torch.from_numpy(pixels.total(images)), ledger[fused.LEAVING].clone(), ledger
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        *nets, ctx.rows, ctx.arguments, ctx.workspace = inputs
-        ctx.save_for_backward(*nets)
-        ctx.mark_non_differentiable(output[2])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, by_image, by_leaving, _):
-        nets = [t.detach().contiguous().numpy() for t in ctx.saved_tensors]
-        scratch = _blocks(ctx.arguments, ctx.workspace)[1]
-        sums = ctx.workspace("nets", 3, len(scratch), *nets[0].shape)
-        backward(ALL, by_image.contiguous().numpy(), float(by_leaving), sums, scratch, *ctx.rows, *nets, *ctx.arguments)
-        return torch.from_numpy(pixels.total(sums[0])), torch.from_numpy(pixels.total(sums[2])), None, None, None
-
-
-def _blocks(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
-    """Images and scratch of all blocks, to be overwritten."""
-    area, *_, frame, splat = arguments[2:]
-    return _images((area, frame, splat, None), workspace)
+        store(w[OUT_Z], start, count, v[rows.BY_SAG])
+        store(w[OUT_ZX], start, count, v[rows.BY_GX])
+        store(w[OUT_ZY], start, count, v[rows.BY_GY])
