@@ -51,7 +51,6 @@ from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
-from caustic_cli.optics.trace import evaluates_by_rows
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.schema.table import LensSettings, ScreenSettings, check, default
@@ -386,13 +385,11 @@ class OneSurface(Problem):
         """
         scene, goal, first = self.scene, grey(self.target.numpy()), self.stages[0]
         spans = min(n - p for n, p in zip(first.control, scene.lens.degree, strict=True))
+        cells = transport_cells(max(s.rays for s in self.stages), not scene.source.collimated, spans, self.effort.source_cells)
         spread = source_spread(scene) if first.spread else None
-        centre = scene if spread is None else replace(scene, source=point_source(scene))
-        scattered = not scene.source.collimated and (scene.source.distant or not evaluates_by_rows(centre))
-        cells = transport_cells(max(s.rays for s in self.stages), scattered, spans, self.effort.source_cells)
         if spread is not None:
             light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
-            scene, goal = replace(centre, screen=scene.screen.grown(light.beside)), light.light
+            scene, goal = replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
         surface, lens = self.solved(scene, goal, cells, fixed, seconds), self.scene.lens
         short = lens.z_in + lens.min_thickness - float(surface.heights.min())
         return replace(surface, heights=surface.heights + 1.01 * short) if fixed and short > 0 else surface
