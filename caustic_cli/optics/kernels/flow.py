@@ -102,14 +102,14 @@ def _backward(adjoint):
     return flow_adjoint
 
 
-class Flow(NamedTuple):
+class IndexFlow(NamedTuple):
     """The integrator for an index: its two kernels."""
 
     forward: Any
     backward: Any
 
     @classmethod
-    def of(cls, index, adjoint) -> Flow:
+    def of(cls, index, adjoint) -> IndexFlow:
         """For an index, by its functions."""
         return cls(_forward(index), _backward(adjoint))
 
@@ -123,7 +123,7 @@ class Flow(NamedTuple):
 
 class _Flow(torch.autograd.Function):
     @staticmethod
-    def forward(flow: Flow, medium: tuple, weights, steps, coefficients, time, *ray):
+    def forward(flow: IndexFlow, medium: tuple, weights, steps, coefficients, time, *ray):
         out, c, rays = np.empty((8, len(time))), _array(coefficients), np.stack([_array(v) for v in ray])
         flow.forward(ALL, c, medium, rays, _array(time), weights, steps, out, blocks())
         return tuple(torch.from_numpy(row) for row in out)

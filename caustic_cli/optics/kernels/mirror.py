@@ -13,7 +13,7 @@ by_v is the derivative of whatever is differentiated by v.
 from __future__ import annotations
 
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import Stage, load, store, store_flags
+from caustic_cli.optics.kernels.stage import RayStage, load, store, store_flags
 
 DX, DY, DZ, GX, GY, BY_TX, BY_TY, BY_TZ, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, ROWS = range(14)
 
@@ -62,4 +62,4 @@ def _pull(v, start, count, ray, _parameters, given, out):
         store(v[BY_DX + i], start, count, out[i])
 
 
-REFLECT = Stage.of(_reflect, _pull, ROWS, 3)
+REFLECT = RayStage.of(_reflect, _pull, ROWS, 3)

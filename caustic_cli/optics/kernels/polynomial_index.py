@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.optics.kernels.flow import Flow
+from caustic_cli.optics.kernels.flow import IndexFlow
 from caustic_cli.optics.kernels.jit import FAST, njit
 
 
@@ -50,5 +50,5 @@ def _adjoint(terms, medium, x, y, z, mx, my, mz, s, t, _b, _room, _by_c):
 
 
 #: A function of the coefficients of v, the constant first, of (whether s = z, whether v is n^2, n^2 below which n is cut off), and
-#: of what `Flow` takes besides.
-formula_flow = Flow.of(_index, _adjoint)
+#: of what `IndexFlow` takes besides.
+formula_flow = IndexFlow.of(_index, _adjoint)

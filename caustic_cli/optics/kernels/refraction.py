@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from caustic_cli.optics.kernels.fresnel import cosine_behind, reflectance
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import Stage, load, store, store_flags
+from caustic_cli.optics.kernels.stage import RayStage, load, store, store_flags
 from caustic_cli.optics.tolerances import NORMAL
 
 # Rows of a batch's scratch: the ray, f; t and P', or in the adjoint derivatives by them, and whether light passes; derivatives by
@@ -167,4 +167,4 @@ def _refract_adjoint(v, start, count, ray, surface, given, out):
         store(v[BY_DX + i], start, count, out[i])
 
 
-REFRACT = Stage.of(_refract, _refract_adjoint, ROWS, 4)
+REFRACT = RayStage.of(_refract, _refract_adjoint, ROWS, 4)

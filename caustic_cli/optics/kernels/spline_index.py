@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels.flow import Flow
+from caustic_cli.optics.kernels.flow import IndexFlow
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.spline import axis, piece
 
@@ -142,5 +142,5 @@ def _adjoint(c, axes, x, y, z, mx, my, mz, s, t, b, room, by_c):
     return n * n, n, n * nx, n * ny, n * nz, lx, ly, lz
 
 
-#: A function of coefficients (n, m, k), of the axes as of `volume_axis`, and what `Flow` takes besides.
-volume_flow = Flow.of(_index, _adjoint)
+#: A function of coefficients (n, m, k), of the axes as of `volume_axis`, and what `IndexFlow` takes besides.
+volume_flow = IndexFlow.of(_index, _adjoint)

@@ -86,7 +86,7 @@ def _arrays(value):
     return tuple(map(_arrays, value)) if type(value) is tuple else value  # a named one is of numbers
 
 
-class Stage(NamedTuple):
+class RayStage(NamedTuple):
     """A stage: its batch functions, how many rows of scratch these use and how many results they have; its kernels, and how one is
     run on tensors: (kernel, count, *arguments)."""
 
@@ -97,7 +97,7 @@ class Stage(NamedTuple):
     run: Callable[..., None]
 
     @classmethod
-    def of(cls, forward, adjoint, rows: int, outputs: int, kernel: Callable = _kernel, run: Callable = _run) -> Stage:
+    def of(cls, forward, adjoint, rows: int, outputs: int, kernel: Callable = _kernel, run: Callable = _run) -> RayStage:
         """With kernels made of the batch functions by `kernel`."""
         return cls((forward, adjoint), rows, outputs, (kernel(forward, rows), kernel(adjoint, rows)), run)
 
@@ -109,14 +109,14 @@ class Stage(NamedTuple):
         return _Applied.apply(self, parameters, *ray)
 
 
-def here(stage: Stage) -> Stage:
+def here(stage: RayStage) -> RayStage:
     """The stage itself, which runs on the CPU: others may make one for another device of it."""
     return stage
 
 
 class _Applied(torch.autograd.Function):
     @staticmethod
-    def forward(stage: Stage, parameters: tuple, *ray):
+    def forward(stage: RayStage, parameters: tuple, *ray):
         like = _like(ray)
         out, flags = tuple(torch.empty_like(like) for _ in range(stage.outputs)), torch.empty_like(like, dtype=torch.bool)
         stage.run(stage.kernels[0], len(like), _components(ray, like), parameters, (), (out, flags))

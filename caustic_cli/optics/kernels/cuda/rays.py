@@ -7,7 +7,7 @@ from functools import cache
 from numba import cuda, float64
 
 from caustic_cli.optics.kernels.cuda.launch import device, start
-from caustic_cli.optics.kernels.stage import Stage
+from caustic_cli.optics.kernels.stage import RayStage
 
 
 def _kernel(batch, rows: int):
@@ -28,6 +28,6 @@ def _run(kernel, count: int, *arguments) -> None:
 
 
 @cache
-def on_device(stage: Stage) -> Stage:
+def on_device(stage: RayStage) -> RayStage:
     """A stage for tensors on the device."""
-    return Stage.of(stage.batches[0], stage.batches[1], stage.rows, stage.outputs, _kernel, _run)
+    return RayStage.of(stage.batches[0], stage.batches[1], stage.rows, stage.outputs, _kernel, _run)
