@@ -175,7 +175,7 @@ def refinement(
     rays: int | None,
     resolution: tuple[int, int],
     how: Refinement,
-    scattered: bool = False,
+    fewer: int = 1,
     spread: bool = False,
 ) -> list[Table]:
     """The default stages after a transport start, which is accurate at every scale: full resolution from the beginning.
@@ -185,13 +185,13 @@ def refinement(
 
     Args:
         rays: of the last stage, None for the default of the quality.
-        scattered: the source's rays are intersected individually, so a quarter of them is used.
+        fewer: divisor of the default number of rays.
         spread: as for a stage; light that the source spreads beyond the screen is not an error.
     """
     pixels, most, plan = math.prod(resolution), how.most_rays, how.plan
     if large := how.large_at(max(resolution)):
         most, plan = max(most, min(large.rays_per_pixel * pixels, large.most_rays)), large.plan or plan
-    rays = rays or max(LEAST_RAYS, min(most, how.rays_per_pixel * pixels) // (4 if scattered else 1))
+    rays = rays or max(LEAST_RAYS, min(most, how.rays_per_pixel * pixels) // fewer)
     finer = max(1, min(how.subdivision, math.isqrt(rays // pixels)))
     apron = 0 if spread else math.ceil(0.04 * max(resolution))
     stages = []

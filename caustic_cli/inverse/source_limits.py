@@ -141,16 +141,21 @@ def point_source(scene: Scene) -> Source:
     return source
 
 
+def points_of(spread: Spread) -> int:
+    """Number of points of a source whose blurs represent it: one if the blur varies little over it."""
+    each = math.ceil((spread.usual / (EXACT * max(spread.reach()))) ** 2)
+    return 1 if each <= 1 or not min(spread.half) > 0 else min(each, MOST_MODES)
+
+
 def regular_rays(
     scene: Scene, spread: Spread, stage: Stage, seed: int, device: str | torch.device
 ) -> tuple[Scene, Rays | list[Rays], list[Convolution]]:
     """Rays of a stage whose images are convolved with the blur: from the centre of the source, or from several of its points where
     the blur varies over it; with the scene to trace them in and the convolution for the image of each point."""
-    pixel, each = scene.screen.pixel, math.ceil((spread.usual / (EXACT * max(spread.reach()))) ** 2)
-    if each <= 1 or not min(spread.half) > 0:
+    pixel, each = scene.screen.pixel, points_of(spread)
+    if each == 1:
         scene = replace(scene, source=point_source(scene))
         return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, stage.rendering.oversample)]
-    each = min(each, MOST_MODES)
     parts = spread.parts_on(pixel, spots(scene.source, each), stage.rendering.oversample)
     return scene, RegularGrid.of_modes(modes(scene, each), stage.rays, device), parts
 

@@ -13,13 +13,15 @@ from caustic_cli.config.design import relative_to_initial
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen
 from caustic_cli.effort import DRAFT, EFFORTS, FINE, STANDARD, Effort, current_effort
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.source_limits import point_source, source_spread
+from caustic_cli.inverse.source_limits import point_source, points_of, source_spread
 from caustic_cli.optics.trace import evaluates_by_rows
 from caustic_cli.scene import Scene, Source
 from caustic_cli.schema.table import DesignSettings, LensSettings, StageSettings, check
 
 EXTENDED = 5.0  # factor of the time limits of qualities for an extended source, whose start includes a deconvolution
 LEAST_SPANS = STANDARD.refinement.least_spans  # which resolve an initial surface
+#: See `Defaults.fewer_rays`.
+SCATTERED, BLURRED = 4, 2
 
 
 class Defaults:
@@ -122,11 +124,17 @@ class Defaults:
         """Whether the source's extent only shifts the image."""
         return source_spread(self._scene) is not None
 
-    def scattered(self, spread: bool) -> bool:
-        """Whether every ray has to be intersected with the surface; spread: those of the source's centre are traced."""
+    def fewer_rays(self, spread: bool) -> int:
+        """By what factor rays are fewer than those of a plane wave: where every one has to be intersected with the surface, and of
+        a near source, whose start takes longer the more there are; spread: those of the source's centre are traced."""
         scene = self._scene
-        scene = replace(scene, source=point_source(scene)) if spread else scene
-        return not (scene.source.collimated or evaluates_by_rows(scene))
+        centre = replace(scene, source=point_source(scene)) if spread else scene
+        if centre.source.collimated:
+            return 1
+        blur = source_spread(scene) if spread else None
+        return (
+            SCATTERED if (blur is not None and points_of(blur) > 1) or not evaluates_by_rows(centre) else BLURRED if spread else 1
+        )
 
     @property
     def _scene(self) -> Scene:

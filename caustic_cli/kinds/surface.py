@@ -250,7 +250,7 @@ class OneSurface(Problem):
         """The stages after a transport start."""
         spread = cls.spread(d)
         how = d.effort.creased if creased else d.effort.refinement
-        return refinement(d.lens.control, d.rays, d.resolution, how, d.scattered(spread), spread)
+        return refinement(d.lens.control, d.rays, d.resolution, how, d.fewer_rays(spread), spread)
 
     # Numerics
 

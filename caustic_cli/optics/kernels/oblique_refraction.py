@@ -1,5 +1,5 @@
 """Refraction of a row of rays of any direction at the exit surface and transfer to an upright screen, with the adjoint, for the CPU
-kernels: `refraction.bend` and `transfer.arrive` one after another.
+kernels: `refraction.bend` and the transfer one after another.
 
 Input: distances along the rays to their intersections (mm; -1 for none), dz/dx and dz/dy there, x and y of the origins, transverse
 components of unit directions, and powers.  Output, in `rows`' vectors: POWER, PX, PY, FLUX.
@@ -17,16 +17,21 @@ from caustic_cli.optics.kernels.refraction import bend
 from caustic_cli.optics.kernels.refraction import pull as pull_refraction
 from caustic_cli.optics.kernels.rows import BESIDE, MISSED_POWER, REFLECTED_POWER
 from caustic_cli.optics.kernels.stage import BATCH, load, store
-from caustic_cli.optics.kernels.transfer import TargetPlane, arrive
-from caustic_cli.optics.kernels.transfer import pull as pull_landing
+from caustic_cli.optics.tolerances import PARALLEL
 
 # Rows of a batch's scratch: the ray; power and landing point, or in the adjoint derivatives by them; derivatives by the input.
 REACH, GX, GY, DX, DY, P, X, Y, POWER, PX, PY, BY_REACH, BY_GX, BY_GY, ROWS = range(15)
 
 
 @njit(inline="always", **FAST)
-def _screen(exit_):
-    return TargetPlane(0.0, 0.0, exit_.height, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0)
+def _path(z, tz, height):
+    """k of `transfer` to an upright screen, 1 / v, and whether the ray is on its way: products with the plane's zeros and ones take
+    time, since the compiler must keep them."""
+    arrives = tz > PARALLEL
+    over = 1.0 / (tz if arrives else 1.0)
+    k = (height - z) * over
+    on_way = arrives & (k > 0.0)
+    return k if on_way else 0.0, over, on_way
 
 
 # No array is passed on inside these loops, nor taken from a tuple: they would not be vectorised.
@@ -35,29 +40,31 @@ def _screen(exit_):
 @njit(inline="always", **FAST)
 def aim_batch(w, count, exit_, frame):
     """Powers and landing points, in pixels."""
-    n, fresnel, begin, plane = exit_.index, exit_.fresnel, exit_.start, _screen(exit_)
+    n, fresnel, begin, height = exit_.index, exit_.fresnel, exit_.start, exit_.height
     over_x, over_y, low_x, low_y = 1.0 / frame.pixel_x, 1.0 / frame.pixel_y, frame.low_x, frame.low_y
     for j in range(count):
         t, gx, gy, dx, dy = w[REACH, j], w[GX, j], w[GY, j], w[DX, j], w[DY, j]
         dz = math.sqrt(max(1.0 - dx * dx - dy * dy, 0.0))
         tx, ty, tz, kept, passes = bend(dx, dy, dz, gx, gy, 0.5, n, fresnel)
-        px, py, on_way = arrive(w[X, j] + t * dx, w[Y, j] + t * dy, begin + t * dz, tx, ty, tz, plane)
+        k, _, on_way = _path(begin + t * dz, tz, height)
         power = w[P, j] * kept if passes else REFLECTED_POWER
         w[POWER, j] = power if t >= 0.0 else MISSED_POWER
-        w[PX, j] = (px - low_x) * over_x if on_way else BESIDE
-        w[PY, j] = (py - low_y) * over_y
+        w[PX, j] = (w[X, j] + t * dx + k * tx - low_x) * over_x if on_way else BESIDE
+        w[PY, j] = (w[Y, j] + t * dy + k * ty - low_y) * over_y
 
 
 @njit(inline="always", **FAST)
 def pull_batch(w, count, exit_):
     """Derivatives by distances and slopes, from those by powers and landing points, per mm."""
-    n, fresnel, begin, plane = exit_.index, exit_.fresnel, exit_.start, _screen(exit_)
+    n, fresnel, begin, height = exit_.index, exit_.fresnel, exit_.start, exit_.height
     for j in range(count):
         t, gx, gy, dx, dy, power, by_power = w[REACH, j], w[GX, j], w[GY, j], w[DX, j], w[DY, j], w[P, j], w[POWER, j]
         dz = math.sqrt(max(1.0 - dx * dx - dy * dy, 0.0))
-        x, y, z = w[X, j] + t * dx, w[Y, j] + t * dy, begin + t * dz
         tx, ty, tz, _, _ = bend(dx, dy, dz, gx, gy, 0.5, n, fresnel)
-        by_x, by_y, by_z, by_tx, by_ty, by_tz = pull_landing(x, y, z, tx, ty, tz, plane, w[PX, j], w[PY, j])
+        k, over, on_way = _path(begin + t * dz, tz, height)
+        by_x, by_y = w[PX, j], w[PY, j]
+        by_z = -(by_x * tx + by_y * ty) * over if on_way else 0.0
+        by_tx, by_ty, by_tz = k * by_x, k * by_y, k * by_z
         _, _, _, by_gx, by_gy, _, _ = pull_refraction(dx, dy, dz, gx, gy, 0.5, power, n, fresnel, by_tx, by_ty, by_tz, by_power)
         by_reach, lit = by_x * dx + by_y * dy + by_z * dz, t >= 0.0
         w[BY_REACH, j], w[BY_GX, j], w[BY_GY, j] = by_reach if lit else 0.0, by_gx if lit else 0.0, by_gy if lit else 0.0
