@@ -148,7 +148,7 @@ def test_cuda_is_not_loaded_for_a_cpu():
 def test_waves_stay_on_the_device_of_their_field():
     """Propagation is torch's FFT: on torch's device without numbers, which refuses whatever was made on another, all of it runs."""
     phase, amplitude = (torch.zeros(8, 8, dtype=torch.float64, device="meta", requires_grad=True) for _ in range(2))
-    rows, columns = (propagation.cells(-1.0, 0.5, 4, -1.2, 0.2, 16, phase.device) for _ in range(2))
+    rows, columns = (propagation.cells(propagation.pixel_edges(-1.0, 0.5, 4, -1.2, 0.2, 16).to(phase.device), 16) for _ in range(2))
     image = propagation.power_on_pixels(phase, amplitude, (16, 16), rows, columns)
     image.sum().backward()
     assert image.device.type == phase.grad.device.type == "meta" and image.shape == (4, 4)
