@@ -99,7 +99,7 @@ def test_rays_under_the_control_point_are_all_that_matter(name, kind, monkeypatc
     field = HeightField.of(scene.lens)
     rays, traced = rays_of(scene, kind, 3000, 3), []
     leaf, y = heights.clone().requires_grad_(), torch.randn(23, 19, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    for tracer in tracers(scene, field, rays, torch.float64, 1000):
+    for tracer in tracers(scene, field, rays, torch.float64, 1000, gradmap.STAGES):
         image = tracer.expose({EXIT: leaf}, scene.screen, COSINE).image
         (y * (image.sum(0) if scene.colored else image)).sum().backward()
 

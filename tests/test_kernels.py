@@ -17,10 +17,11 @@ from helpers import pairwise
 
 from caustic_cli.commands import console
 from caustic_cli.inverse import transport
+from caustic_cli.inverse.wave_objective import WaveObjective
 from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import IDENTITY
-from caustic_cli.optics.kernels import ahead, banded, fused, multigrid, pixels, random_points, refraction, spline
+from caustic_cli.optics.kernels import ahead, banded, fields, fused, multigrid, pixels, random_points, refraction, spline
 from caustic_cli.optics.kernels import filter_weights as kernel_shares
 from caustic_cli.optics.kernels.fused_functions import PlaneKernel
 from caustic_cli.optics.kernels.jit import njit
@@ -244,15 +245,20 @@ def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
     for part in ahead.PARTS:
         ahead.compile_part(part)
     kernels = [fused.forward, fused.backward, pixels.sums, spline.evaluate, spline.pull_back, banded._contract, banded._spread]
-    kernels += [spline.evaluate_net, spline.pull_coefficients, refraction.refract, random_points.scatter]
+    kernels += [spline.evaluate_net, spline.pull_coefficients, refraction.REFRACT.kernels[0], random_points.scatter]
     kernels += [multigrid.matrix, multigrid._coarsen, multigrid._sweep, multigrid._residual]
-    assert {name for name, _ in ahead.PARTS.values()} <= {f"{k.__module__.rpartition('.')[2]}.{k.__name__}" for k in kernels}
+    kernels += [getattr(fields, name) for name in ("reduce_phase", "make_field", "on_pixels", "widen", "weigh", "make_pull")]
+    by_degree = [fields.displace, fields.pull_displacement]  # compiled for each, ahead for cubics
+    names = {f"{k.__module__.rpartition('.')[2]}.{k.__name__}" for k in kernels + by_degree}
+    assert {name for name, _ in ahead.PARTS.values()} <= names
     compiled = [list(kernel.signatures) for kernel in kernels]
     for kind, rays in (("lines", 900), ("stratified", 1500), ("uniform", 900), ("uniform", 1)):
         image, *_ = next(exposures(scene("schlick"), heights().requires_grad_(), FILTERS[-1], kind, dtype, rays))
         image.sum().backward()
     transport.solve(np.ones((8, 8)), np.ones((64, 64)), (1.0, 1.0), (1.0, 1.0))
-    wave_image(scene(), HeightField.of(scene().lens), heights(rough=0.0).requires_grad_()).image.sum().backward()
+    of = scene(), HeightField.of(scene().lens), heights(rough=0.0)
+    wave_image(*of[:2], of[2].requires_grad_()).image.sum().backward()
+    WaveObjective(*of, torch.ones(scene().screen.resolution, dtype=torch.float64), "rms", wavelengths=(550.0,))(of[2].detach())
     assert [list(kernel.signatures) for kernel in kernels] == compiled
 
 

@@ -136,8 +136,8 @@ def finite_difference(
 ) -> Tensor:
     """The same derivative by central differences of two float64 renders with the same rays: (n_x, n_y), per mm.
 
-    Every ray is traced by `expose`, independently of the selection and differentiation in `gradient_image`.  Float64 whatever the
-    render uses: in float32 the difference of two nearly equal images is rounding.
+    Every ray is traced by `expose`, by stages, independently of the selection and differentiation in `gradient_image`.  Float64
+    whatever the render uses: in float32 the difference of two nearly equal images is rounding.
 
     Args:
         step: half the distance between the two heights, mm; None for `difference_step`.
@@ -147,7 +147,7 @@ def finite_difference(
     heights = heights.detach().double()
     above, below = heights + step * direction, heights - step * direction
     distance = float((above - below)[tuple(control)])  # not 2 step: a height near 5 mm has only so many digits
-    images = [expose(scene, field, h, sampler, filter).image for h in (above, below)]
+    images = [expose(scene, field, h, sampler, filter, requests=STAGES).image for h in (above, below)]
     difference = (images[0] - images[1]) / distance
     return difference.sum(0) if scene.colored else difference
 

@@ -13,6 +13,7 @@ import torch
 from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.kernels import fused_functions
+from caustic_cli.optics.kernels.arguments import RowsOfRays
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.scene import Screen
 
@@ -83,16 +84,15 @@ def splatted(nets, x, y, directions, power, fresnel: str, eta: float, filter: Fi
     nets: distances along the rays (or heights) and slopes, (1, N); directions: x and y of them, None for a plane wave.
     """
     along = [fused_functions._NONE] * 2 if directions is None else [fused_functions._strided(c.numpy()) for c in directions]
-    rays = (*(fused_functions._strided(a.numpy()) for a in (x, y)), *along, fused_functions._strided(power.numpy()))
+    x, y, power = (fused_functions._strided(a.numpy()) for a in (x, y, power))
     ones = np.ones((1, 1))
     return fused_functions._splat(
         nets,
         (np.zeros(1, np.int64), ones, ones),
         True,
-        rays,
+        RowsOfRays(x, y, *along, power),
         (eta, fresnel),
-        HEIGHT,
-        0.0,
+        (0.0, HEIGHT),
         SCREEN,
         filter,
         fused_functions._Workspace(),
