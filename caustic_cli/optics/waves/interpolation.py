@@ -112,8 +112,16 @@ class FineWavefront:
     @cached_property
     def whole(self) -> tuple[Tensor, Tensor]:
         """Path, mm, and amplitude of every cell, (n, m) float64."""
-        path, root, lit = self.rows()
-        return path, root * lit
+        if torch.is_grad_enabled() and self.path.requires_grad:
+            path, root, lit = self.rows()
+            return path, root * lit
+        count = len(self.path) if self.along_x is None else len(self.along_x[0])
+        path, amplitude = (self.path.new_empty(count, self.path.shape[1]) for _ in range(2))
+        for start in range(0, count, BLOCK):  # what they are made of takes as much memory again
+            part = slice(start, start + BLOCK)
+            path[part], root, lit = self.rows(part)
+            amplitude[part] = root * lit
+        return path, amplitude
 
     def _at(self, c: Tensor, part: slice) -> Tensor:
         return c[part] if self.along_x is None else interpolate(c, tuple(t[part] for t in self.along_x), None)
