@@ -213,7 +213,7 @@ class OneSurface(Problem):
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
         """The stages on rays unless they are given; waves: those on the wave image that follow.
 
-        Stages on rays after an accurate initial surface do not lower the error of the wave image that is reached after them.
+        After an accurate initial surface, stages on rays do not lower the error that stages on the wave image end with.
         """
         lens = d.lens
         if cls.exact_start(d):
