@@ -18,6 +18,8 @@ from caustic_cli.scene import Scene
 
 #: Odd multipliers that hash a ray's coordinates to one index (Knuth; Steele).
 MIX = (-7046029254386353131, -4417276706812531889, 0x632BE59BD9B4E019)
+#: Quantum of coordinates that are hashed, mm or 1: coarser than their rounding, which depends on where a ray is in a chunk.
+QUANTUM = 2.0**-30
 #: Seed of the facet slopes at the last element; at the k-th element in front of it the seed is greater by k.
 FACETS = 0xFACE7
 #: Slope standard deviation for the measurement in a scene with smooth surfaces.
@@ -73,5 +75,5 @@ def index_of(rays: RayState) -> Tensor:
         mixed = [c.double().contiguous().view(torch.int64) * m for c, m in zip((s.u, s.v), MIX, strict=False)]
         return (mixed[0][:, None] ^ mixed[1][None, :]).reshape(-1) if s.tensor else mixed[0] ^ mixed[1]
     full = rays.full((*rays.origin[:2], rays.direction[0]))
-    bits = [c.double().contiguous().view(torch.int64) for c in full]
-    return bits[0] * MIX[0] ^ bits[1] * MIX[1] ^ bits[2] * MIX[2]
+    whole = [(c.double() / QUANTUM).round().to(torch.int64) for c in full]
+    return whole[0] * MIX[0] ^ whole[1] * MIX[1] ^ whole[2] * MIX[2]
