@@ -105,6 +105,8 @@ class Effort:
     noise: float = 0.1
     #: Most iterations for the lower bound of the error under an extended source, which then is within some per cent.
     bound_steps: int = 1000
+    #: Points at which the error is measured while a design runs, the initial and the final lens among them.
+    cost_points: int = 8
     #: Whether report.png is drawn, which takes 2.5 s.
     report: bool = True
 
@@ -158,6 +160,7 @@ TEST = replace(
     vertex_cells=32,
     final_rays=40_000,
     bound_steps=400,
+    cost_points=3,
     report=False,
     effect_rays=1000,
     effect_rounds=1,

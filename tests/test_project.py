@@ -16,6 +16,7 @@ from PIL import Image
 from caustic_cli import cli
 from caustic_cli.commands.console import ConsoleReporter
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.accuracy_cost import Row, Start
 from caustic_cli.inverse.designer import State
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.project import checkpoint, directory, uptodate
@@ -46,7 +47,7 @@ def designed(tmp_path_factory):
     begun = workflow.prepare(
         folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=ConsoleReporter(quiet=True)
     )
-    workflow.design(begun, "cpu", ConsoleReporter(quiet=True), 0.0)
+    workflow.design(begun, "cpu", ConsoleReporter(quiet=True), Start.now())
     return begun.project.path
 
 
@@ -97,6 +98,7 @@ def sample(seed=0) -> Checkpoint:
         [(1, 0, 0.1, 1.0, 0.5), (31, 2, 1e-300, 1 / 3, 1e9)],
         12.25,
         "time limit",
+        accuracy=[Row(0, 1.5, 2.75, 1 / 3), Row(31, 9.5, 17.0, 0.1)],
     )
     return Checkpoint(state, spaces, {"seed": 0, "é": "ü"}, {"loss": 1 / 3, "lost": {"fresnel": 0.1}, "psnr_db": None})
 
@@ -110,7 +112,7 @@ def test_save_then_load_is_bitwise(tmp_path):
         assert a.keys() == b.keys()
         assert all(torch.equal(a[k], b[k]) and a[k].dtype == b[k].dtype and a[k].shape == b[k].shape for k in a)
     assert torch.equal(before.state.heights, after.state.heights)
-    for name in ("stage", "iteration", "total", "history", "seconds", "reason"):
+    for name in ("stage", "iteration", "total", "history", "accuracy", "seconds", "reason"):
         assert getattr(before.state, name) == getattr(after.state, name), name
     assert [s.degree for s in after.spaces] == [3, 2]
     assert all(torch.equal(a.knots, b.knots) for a, b in zip(before.spaces, after.spaces, strict=True))

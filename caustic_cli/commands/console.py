@@ -31,7 +31,7 @@ from caustic_cli.errors import LISTS, MARK, InputError, plain_name, shortened
 from caustic_cli.loading import OnDemand
 from caustic_cli.schema.table import TABLE
 
-irradiance = OnDemand("caustic_cli.studies.irradiance")
+irradiance, accuracy_cost = OnDemand("caustic_cli.studies.irradiance"), OnDemand("caustic_cli.inverse.accuracy_cost")
 
 #: Seconds between lines of --progress json.
 LINE_EVERY = 0.5
@@ -257,10 +257,18 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         *([] if by_waves else _noise_of_image(figures)),
         ("iterations", _number(figures, "iterations", "d")),
         ("time", _number(figures, "seconds", ".1f") + " s"),
+        *_price(figures),
         ("image", f"{figures['wave_image']}; by rays {figures['image']}" if by_waves else str(figures["image"])),
         *([("ended", ended_words(figures["reason"]))] if "reason" in figures else []),
         *([("by rays alone", _rays_alone(figures))] if by_waves else []),
     ]
+
+
+def _price(figures: dict) -> list[tuple[str, str]]:
+    """What a smaller error would cost, of a design."""
+    rows = figures.get("accuracy_cost")
+    words = accuracy_cost.price([accuracy_cost.Row(**row) for row in rows]) if rows else ""
+    return [("accuracy and time", words)] if words else []
 
 
 def _number(figures: dict, key: str, form: str) -> str:

@@ -133,6 +133,11 @@ the root mean square of its angular deviation.
 Wavelengths of the wave image, nm; the continuous spectrum that they represent and by what it is measured, eye or power, null for
 spectral lines; and an estimate of the error of wave_relative_rms that their number leaves.
 .TP
+.B accuracy_cost
+Of a design: rows of iteration, seconds and processor_seconds since its beginning, and error, measured at eight or more iterations
+(all, if they are fewer) by light that the optimiser does not use: of the wave image at seven or more wavelengths other than those
+of its last stage, or by independent rays. The measurements themselves are not part of the times.
+.TP
 .B start_error, start_relative_rms, start_noise
 The same quantities for the initial surface of a design, by the same rays; by waves (start_wave_relative_rms), where it is clearly
 worse than the finished lens, at the wavelengths of the design.

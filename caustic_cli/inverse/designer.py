@@ -19,6 +19,7 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
+from caustic_cli.inverse.accuracy_cost import Row
 from caustic_cli.inverse.lbfgs import UNFIT, curvature
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
@@ -46,13 +47,15 @@ class State:
     optimizer: dict[str, Tensor] = field(default_factory=dict)
     #: Rows (iteration, stage, loss, on_screen, seconds).
     history: list[tuple[int, int, float, float, float]] = field(default_factory=list)
-    #: Elapsed.
+    #: Elapsed in the stages.
     seconds: float = 0.0
     #: Of its end, "" while running.
     reason: str = ""
     #: Initial heights on the control net of the first stage (n_0, m_0), and the same without the limit of the radius.
     start: Tensor | None = None
     unrounded: Tensor | None = None
+    #: Errors by independent light, saved with the rest.
+    accuracy: list[Row] = field(default_factory=list)
     #: Of the last iteration of this run; not saved.
     image: Tensor | None = None
 
@@ -73,6 +76,7 @@ class Designer:
 
     def __init__(self, problem: Problem):
         self.problem, self.scene, self.stages, self.options = problem, problem.scene, problem.stages, problem.options
+        self._origin = 0.0
 
     def field(self, stage: int) -> HeightField:
         """The spline spaces of a stage."""
@@ -161,7 +165,8 @@ class Designer:
         Raises:
             CausticError: no light reaches the screen at the beginning of a stage, or the loss there is not finite.
         """
-        started, earlier = time.monotonic(), state.seconds
+        started = time.monotonic()
+        self._origin = started - state.seconds
         done_in = {row[1] for row in state.history}
         used = {k: s for k, s in enumerate(self.stages) if k >= state.stage or k in done_in or not s.spare}
         first, last = state.stage, len(self.stages) - 1
@@ -173,7 +178,7 @@ class Designer:
             limit = iterations or sum(s.iterations for s in used.values())
             end = partial(self._end, state, k, limit, deadline, stop)
             try:
-                done = self._stage(state, k, end, on_iteration, notice, started - earlier)
+                done = self._stage(state, k, end, on_iteration, notice)
             except Skipped as skipped:
                 notice(f"stage {k + 1}: {skipped}")
                 state.reason, done = skipped.reason, True
@@ -184,6 +189,10 @@ class Designer:
             state = self._next(state, k + 1)
             gc.collect()  # optimiser and objective refer to each other, and hold the memory that the next stage needs
         return state
+
+    def _clock(self) -> float:
+        """Seconds of iterations and of what prepares them, in all runs."""
+        return time.monotonic() - self._origin
 
     def within_limits(self, state: State) -> Tensor:
         """The heights of the state, made feasible for the limits of slope and radius.
@@ -211,7 +220,7 @@ class Designer:
             return not final
         return None
 
-    def _stage(self, state: State, k: int, end: Callable[[], bool | None], on_iteration, notice, origin: float) -> bool:
+    def _stage(self, state: State, k: int, end: Callable[[], bool | None], on_iteration, notice) -> bool:
         """Iterate stage k in place until its `end`.  True: the stage is done; False: the whole design ends here.
 
         Raises:
@@ -237,10 +246,11 @@ class Designer:
             state.heights = heights().detach()
             if not bool(torch.isfinite(state.heights).all()):
                 raise CausticError("the heights stopped being finite; a smaller ⟨lr⟩ may help")
-            state.iteration, state.total, state.seconds = state.iteration + 1, state.total + 1, time.monotonic() - origin
+            state.iteration, state.total, state.seconds = state.iteration + 1, state.total + 1, self._clock()
             state.history.append((state.total, k, method.loss, method.on_screen, state.seconds))
             state.parameters, state.optimizer, state.image = heights.state_dict(), method.state(), method.image
             on_iteration(state)
+            self._origin += self._clock() - state.seconds  # which is not the time of the design itself
         return done
 
     def objective(self, k: int, heights: Heights) -> LossOfHeights:

@@ -94,6 +94,7 @@ class WaveObjective:
             receiver = receiver_of(lines[0].system, screen)
             self.imager = Imager.of(lines, parameters, receiver, watched=_lit(scene, target), dense=True)
             self.changes: list[Any] = []
+            self.fronts: list[Wavefront] = []
             self.parts = list(self._parts(lines[rank::count], parameters))
         self.in_colour = lines[0].colour is not None
         self.colours = len({line.channel for line in lines if line.channel is not None})
@@ -107,6 +108,7 @@ class WaveObjective:
                 if key not in made:  # wavelengths of the same index have the same rays
                     made[key] = len(made), imager.front(line, mode, parameters, sensitive=True)
                     self.changes.append(backend.path_change(self.field, made[key][1].last, self.dtype))
+                    self.fronts.append(made[key][1])
                 number, front = made[key]
                 yield Contribution(line, k, number, imager.exposure(line, front, self.dtype), front.power)
 
@@ -154,6 +156,21 @@ class WaveObjective:
             c[..., a : image.shape[-2] - a, a : image.shape[-1] - a] for c in (image.detach(), xyz if len(xyz) else image)
         )
         return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()), shown.detach())
+
+    @torch.no_grad()
+    def image_at(self, heights: Tensor, wavelengths: tuple[float, ...]) -> Tensor | None:
+        """The image (n_x, n_y) at other wavelengths, nm, by the same wavefronts; None where these differ by wavelength."""
+        lines, a = lines_of(self.scene, self.field, wavelengths), self.apron
+        modes = self.imager.modes(lines[0].system)
+        if self.colours or len(modes) != len(self.fronts) or len({(id(line.system), line.label) for line in lines}) > 1:
+            return None
+        image = torch.zeros(self.loss.target.shape, dtype=torch.float64, device=self.middle.device)
+        for k, (front, change) in enumerate(zip(self.fronts, self.changes, strict=True)):
+            changed = change.of(heights.detach().to(self.middle) - self.middle)
+            for line in lines:
+                found = self.imager.exposure(line, front, self.dtype).image(changed)
+                image += line.part * self.imager.spread_out(found, k).double()
+        return image[a : image.shape[0] - a, a : image.shape[1] - a]
 
     def _channel(self, values: Tensor, part: Contribution) -> Tensor:
         return values if part.line.channel is None else values[part.line.channel]

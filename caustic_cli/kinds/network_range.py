@@ -106,7 +106,9 @@ class NetworkOverRange(OneSurface):
     def further_figures(self, designer: Designer, state: State) -> dict[str, Any]:
         return {"over": self.errors(designer, state, self.effort.final_rays // OVER, self.options.seed)}
 
-    def errors(self, designer: Designer, state: State, rays: int, seed: int, middle: bool = True) -> list[dict[str, float]]:
+    def errors(
+        self, designer: Designer, state: State, rays: int, seed: int, middle: bool = True, noise: bool = True
+    ) -> list[dict[str, Any]]:
         """Figures at each of `Ranges.evaluation_points`, with independent rays: the parameter values by their keys, mm;
         relative_rms, noise, on_screen and of_source of the lens for them; and, with `middle`, middle_relative_rms, of the lens for
         the middle of the ranges used there.
@@ -117,10 +119,10 @@ class NetworkOverRange(OneSurface):
         over, field, target = self.ranges, designer.field(state.stage), self.target.numpy()
         lens_of_middle, rows = self.heights_at(designer, state, over.middle), []
         for values in over.evaluation_points():
-            scene, row = over.scene(self.scene, values), dict(zip(over.keys, values, strict=True))
+            scene, row = over.scene(self.scene, values), dict[str, Any](zip(over.keys, values, strict=True))
             heights = self.heights_at(designer, state, values)
-            figures = retrace(scene, field, heights, target, rays=rays, seed=seed, device=self.device)[1]
-            row |= {key: figures[key] for key in ("relative_rms", "noise", "on_screen", "of_source")}
+            figures = retrace(scene, field, heights, target, rays=rays, seed=seed, device=self.device, noise=noise)[1]
+            row |= {key: figures.get(key) for key in ("relative_rms", "noise", "on_screen", "of_source")}
             if middle:
                 of_middle = retrace(scene, field, lens_of_middle, target, rays=rays, seed=seed, device=self.device, noise=False)[1]
                 row["middle_relative_rms"] = of_middle["relative_rms"]

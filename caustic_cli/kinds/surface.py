@@ -6,7 +6,8 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
+from weakref import ref
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from caustic_cli.config.design import build_options, build_stages, relative_to_i
 from caustic_cli.config.settings import Settings, build_screen
 from caustic_cli.config.wave_stages import wave_stages
 from caustic_cli.effort import current_effort
-from caustic_cli.errors import InputError
+from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
@@ -54,9 +55,10 @@ from caustic_cli.optics.system import trace_arguments
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.schema.table import LensSettings, ScreenSettings, check, default
-from caustic_cli.studies.retrace import retrace
+from caustic_cli.studies.retrace import evaluation_rays, retrace
 
 waves, manufacture = OnDemand("caustic_cli.inverse.wave_objective"), OnDemand("caustic_cli.studies.manufacture")
+by_waves = OnDemand("caustic_cli.studies.waves")
 
 DEFAULT_SPANS = 128  # knot spans of the final net; divisible by 2 through the stages
 NETWORK_CONTROL = 50  # table D.2
@@ -105,6 +107,8 @@ class OneSurface(Problem):
     adapts = True
     #: The objective of a stage on the wave image, made in order to leave out stages on rays before it.
     _ahead: Ahead | None = None
+    #: The stage on the wave image that runs, or the last that did, and its objective.
+    _refining: tuple[int, ref[LossOfHeights]] | None = None
 
     # Settings
 
@@ -286,8 +290,11 @@ class OneSurface(Problem):
         if stage.waves:
             made, self._ahead = self._ahead, None
             if made is not None and made.of(scene, k, initial):
-                return made.objective
-            return self.on_waves(self.lit(scene, k), k, initial)
+                refined = made.objective
+            else:
+                refined = self.on_waves(self.lit(scene, k), k, initial)
+            self._refining = k, ref(refined)
+            return refined
         if stage.spare and self.takes_waves(scene, k, initial):
             raise Skipped("left out, since the wave image is refined", "waves")
         if stage.spread and (objective := self.on_spread(self.lit(scene, k), k, initial)) is not None:
@@ -477,14 +484,34 @@ class OneSurface(Problem):
         evaluation.figures |= self.further_figures(designer, evaluation.state)
         return evaluation.result()
 
-    def errors(self, designer: Designer, state: State, rays: int, seed: int, middle: bool = True) -> list[dict[str, Any]]:
-        """Figures of the lens with independent rays, a row for each scene that it is for.
+    def errors(
+        self, designer: Designer, state: State, rays: int, seed: int, middle: bool = True, noise: bool = True
+    ) -> list[dict[str, Any]]:
+        """Figures of the lens with independent rays, a row for each scene that it is for; noise: with that of its error.
 
         Raises:
             CausticError: no light reaches the screen.
         """
         traced = trace_arguments(self.scene, designer.field(state.stage), state.heights)
-        return [retrace(*traced, self.target.numpy(), rays=rays, seed=seed, device=self.device)[1]]
+        return [retrace(*traced, self.target.numpy(), rays=rays, seed=seed, device=self.device, noise=noise)[1]]
+
+    def error_of(self, designer: Designer, state: State) -> float | None:
+        """Error of a lens by light that the optimiser does not use, as `evaluate` judges it but faster: of the wave image if that
+        is refined and exists, else the quadratic mean of `errors`, without that of their noise; None if no light reaches the
+        screen."""
+        used = next((stage.waves for stage in reversed(self.stages) if stage.waves), ())
+        if used and self.one_scene:
+            objective = self._refining[1]() if self._refining is not None and self._refining[0] == state.stage else None
+            approximately = {} if objective is None else {"image_at": cast(Any, objective).image_at}
+            lens = self.scene, designer.field(state.stage), state.heights.to(self.device)
+            if (error := by_waves.fast_error(*lens, self.target.numpy(), used, **approximately)) is not None:
+                return error
+        rays = max(1, int(evaluation_rays(self.scene, self.effort.final_rays) / max(1.0, self.further_retraces)))
+        try:
+            rows = self.errors(designer, state, rays, self.options.seed, middle=False, noise=False)
+        except CausticError:
+            return None
+        return math.sqrt(math.fsum(row["relative_rms"] ** 2 for row in rows) / len(rows))
 
     def further_figures(self, designer: Designer, state: State) -> dict[str, Any]:
         """Figures beyond those of any kind."""

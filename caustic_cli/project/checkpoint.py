@@ -9,6 +9,7 @@
     /state                    attributes stage, iteration, total, seconds, reason
     /state/parameters/*, /state/optimizer/*   tensors by name
     /history                  (iterations, 5): iteration, stage, loss (eq. 5.2.1), on_screen, seconds
+    /accuracy                 (rows, 4): iteration, seconds, processor seconds, error by independent light
     attributes                format_version (2 with packed nets, else 1), created_by, provenance, results, inputs (JSON)
 
 A file whose writer was killed cannot be read, so a checkpoint is never updated in place: it is written to a temporary file and
@@ -37,6 +38,7 @@ import torch
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.accuracy_cost import Row
 from caustic_cli.inverse.designer import State
 from caustic_cli.io.files import open_regular, write_bytes
 from caustic_cli.optics.bspline import SplineSpace
@@ -110,6 +112,8 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
                 part[key] = value.detach().cpu().numpy()
         f["history"] = np.array(state.history, dtype=np.float64).reshape(-1, len(HISTORY))
         f["history"].attrs["columns"] = ",".join(HISTORY)
+        f["accuracy"] = np.array(state.accuracy, dtype=np.float64).reshape(-1, len(Row._fields))
+        f["accuracy"].attrs["columns"] = ",".join(Row._fields)
     write_bytes(path, seal(image.getbuffer()), image.getbuffer())
 
 
@@ -247,6 +251,9 @@ def _read(f: h5py.File) -> Checkpoint:
     rows = contents.read("history")
     if rows.ndim != 2 or rows.shape[1] != len(HISTORY) or len(rows) > MOST_ITERATIONS:
         raise ValueError("history")
+    measured = contents.read("accuracy") if "accuracy" in f else np.empty((0, len(Row._fields)))
+    if measured.ndim != 2 or measured.shape[1] != len(Row._fields) or len(measured) > MOST_ITERATIONS:
+        raise ValueError("accuracy")
     group = f["state"]
     heights = contents.net(HEIGHTS)
     state = State(
@@ -254,6 +261,7 @@ def _read(f: h5py.File) -> Checkpoint:
         **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
         **{name: {k: contents.tensor(f"state/{name}/{k}") for k in group[name]} for name in ("parameters", "optimizer")},
         history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
+        accuracy=[Row(int(r[0]), *map(float, r[1:])) for r in measured],
         seconds=float(group.attrs["seconds"]),
         reason=str(group.attrs["reason"]),
         **{name: contents.net(name, heights) for name in STARTS if name in f},

@@ -99,6 +99,8 @@ def write_report(
     encoding: str,
     waves: np.ndarray | None = None,
     stages: Sequence[tuple[float, bool]] = (),
+    costs: Sequence[tuple[float, float]] = (),
+    price: str = "",
     colours: Sequence[Colours | None] = (None, None),
 ) -> None:
     """Write the panels.
@@ -111,6 +113,8 @@ def write_report(
         history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
         waves: (n_x, n_y), the wave image, or None; if given, the error is that of the wave image.
         stages: of each, the blur in its loss, pixels, and whether it uses the wave image.
+        costs: (seconds, error by independent light) during the design, of the image that the lens is judged by.
+        price: what a smaller error would cost, in words.
         colours: of the image by rays and by waves, where they are shown in colour.
     """
     figure = Figure(figsize=(22.0, 9.8))
@@ -133,7 +137,7 @@ def write_report(
     place = axes[1, 1].get_subplotspec()
     axes[1, 1].remove()
     solid = figure.add_subplot(place, projection="3d")
-    _draw_losses(axes[1, 2], history, target.size, figures, stages)
+    _draw_losses(axes[1, 2], history, target.size, figures, stages, costs, price)
     _draw_energy_balance(axes[1, 3], figures)
     _draw_relief(solid, relief, (rx, ry), unit)
     with atomic_file(path) as file:
@@ -287,8 +291,16 @@ def _draw_relief(axis: Axes3D, relief: np.ndarray, half: tuple[float, float], un
     axis.view_init(elev=38, azim=-65)
 
 
-def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, stages: Sequence[tuple[float, bool]]) -> None:
-    """Loss of each stage against time, and the errors of the initial and the final lens by the image that the lens is judged by.
+def _draw_losses(
+    axis: Axes,
+    history: np.ndarray,
+    pixels: int,
+    figures: dict,
+    stages: Sequence[tuple[float, bool]],
+    costs: Sequence[tuple[float, float]],
+    price: str,
+) -> None:
+    """Loss of each stage against time, the independent errors by the image that the lens is judged by, and what less would cost.
 
     Losses by rays and by waves, and with a blur and without, have panels of their own: they cannot be compared with each other.
     """
@@ -305,10 +317,12 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
     axis.set_subplotspec(grid[0])
     panels = {kinds[0]: axis}
     panels |= {kind: axis.get_figure().add_subplot(grid[k], sharex=axis) for k, kind in enumerate(kinds) if k > 0}
-    last = history[-1, 4] if len(history) else 0.0
+    begin = costs[0][0] if costs else 0.0  # of the iterations
+    last = begin + history[-1, 4] if len(history) else begin
+    history = history + np.array([0.0, 0.0, 0.0, 0.0, begin])
     for k, (blur, judge) in how.items():
         _draw_stage(panels[judge, blur > 0], k, blur, history[history[:, 1] == k], pixels, last)
-    _draw_errors(panels[judging, False], figures, judging.prefix, last)
+    _draw_errors(panels[judging, False], figures, judging.prefix, costs, begin, last)
     for kind, own in panels.items():
         own.set_title(_loss_words(*kind, points=own is panels[judging, False]), fontsize="medium")
         own.margins(x=0.08, y=0.12 if own is panels[judging, False] else 0.8)  # room for the names of the stages
@@ -316,7 +330,7 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
         own.grid(alpha=0.3, which="both")
         plain_ticks(own.yaxis)
         own.tick_params(labelbottom=own is panels[kinds[-1]])
-    panels[kinds[-1]].set_xlabel("s")
+    panels[kinds[-1]].set_xlabel("\n".join(["s from the beginning of the design", *filter(None, [price])]))
 
 
 def _draw_stage(axis: Axes, k: int, blur: float, rows: np.ndarray, pixels: int, last: float) -> None:
@@ -336,14 +350,18 @@ def _draw_stage(axis: Axes, k: int, blur: float, rows: np.ndarray, pixels: int, 
     )
 
 
-def _draw_errors(axis: Axes, figures: dict, prefix: str, last: float) -> None:
-    """The errors of the initial lens and of the final one after `last` seconds as points; prefix: of the figures of the image."""
+def _draw_errors(axis: Axes, figures: dict, prefix: str, costs: Sequence[tuple[float, float]], begin: float, last: float) -> None:
+    """The independent errors as points: of the initial lens after `begin` seconds, during the design, and of the final lens after
+    `last`; prefix: of the figures of the image."""
+    between = [row for row in costs if begin < row[0] < last]
     least = min((float(line.get_ydata()[-1]) for line in axis.get_lines()), default=0.0)
-    for key, at, words in ((f"start_{prefix}relative_rms", 0.0, "start"), (f"{prefix}relative_rms", last, "finished")):
+    if between:
+        axis.semilogy(*zip(*between, strict=True), "o", color="black", ms=4)
+    for key, at, words in ((f"start_{prefix}relative_rms", begin, "start"), (f"{prefix}relative_rms", last, "finished")):
         if figures.get(key):
-            axis.semilogy([at], [figures[key]], "o", color="black", ms=5, mfc="none" if at == 0.0 else "black")
+            axis.semilogy([at], [figures[key]], "o", color="black", ms=5, mfc="none" if at == begin else "black")
             away = 10 if least < figures[key] else -10
-            side = {"xytext": (6, 0), "ha": "left"} if at == 0.0 else {"xytext": (0, away), "ha": "right"}
+            side = {"xytext": (6, 0), "ha": "left"} if at == begin else {"xytext": (0, away), "ha": "right"}
             axis.annotate(
                 f"{words} {figures[key]:.3f}",
                 (at, figures[key]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves.image import UNASKED, Perturbation, WaveImage, wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Light, Scene
 from caustic_cli.scene.materials import material
 from caustic_cli.studies.color_error import color_figures
 from caustic_cli.studies.irradiance import irradiance_figures
@@ -25,6 +26,8 @@ from caustic_cli.studies.metrics import figures_of_merit
 FINER = 1.25
 #: Wavelengths relative to a spectral line, for the sensitivity to the wavelength.
 ASIDE = (0.99, 1.01)
+#: Wavelengths of a continuous spectrum for a fast error: how many, least distance from those of the design, nm, and numbers tried.
+FEW, APART, TRIED = 7, 2.0, 6
 #: Figures of a ray image that a wave image has as well.
 _SAME = ("relative_rms", "psnr_db", "ssim", "on_target", "in_black", "on_screen")
 
@@ -103,6 +106,41 @@ def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np
     scene = replace(scene, light=replace(light, wavelengths=wavelengths, weights=weights))
     found = wave_image(scene, field, heights.detach(), finer=FINER)
     return {"wave_unseen_relative_rms": _judged(found, target)["relative_rms"], "wave_unseen_wavelengths": list(wavelengths)}
+
+
+def independent_wavelengths(light: Light, used: Collection[float]) -> tuple[float, ...]:
+    """Wavelengths other than those `used` by a design, nm, at which an image differs little from that of all: of a continuous
+    spectrum, or beside its spectral lines."""
+    if light.continuum is None:
+        return tuple(sorted(a * w for w in light.wavelengths for a in ASIDE))
+    rules = (light.continuum.rule(count)[0] for count in range(FEW, FEW + TRIED))
+    apart = (rule for rule in rules if all(abs(a - b) >= APART for a in rule for b in used))
+    return next(apart, light.continuum.rule(FEW)[0])
+
+
+def fast_error(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    target: np.ndarray,
+    used: Collection[float],
+    image_at: Callable[[Tensor, tuple[float, ...]], Tensor | None] = lambda *_: None,
+) -> float | None:
+    """Relative RMS error of the wave image at `independent_wavelengths`, or of a coloured one at its own.
+
+    image_at: image at heights and wavelengths by an approximation, None where it does not hold, such as that of a `WaveObjective`.
+
+    Returns:
+        the error, None if there is no wave image.
+    """
+    wavelengths = () if scene.light.color else independent_wavelengths(scene.light, used)
+    try:
+        image = image_at(heights, wavelengths) if wavelengths else None
+        if image is None:
+            image = wave_image(scene, field, heights.detach(), wavelengths=wavelengths or None, most=UNASKED).image
+    except NoWaveImage:
+        return None
+    return figures_of_merit(Image(image, 1.0, {}), target)["relative_rms"]
 
 
 def height_deviation(surface: MeasuredSurface, field: HeightField, heights: Tensor) -> Perturbation:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from caustic_cli.config import settings
 from caustic_cli.config.settings import Given
 from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
 from caustic_cli.inverse import ranks
+from caustic_cli.inverse.accuracy_cost import CostOfAccuracy, Start, as_table
 from caustic_cli.inverse.designer import Designer, InitialHeights, State
 from caustic_cli.inverse.reachability import largest_magnification
 from caustic_cli.inverse.surface_from_map import OutOfReach
@@ -183,7 +185,7 @@ class Result:
     figures: dict[str, Any]
 
 
-def design(prepared: PreparedDesign, device: str, say: Reporter, began: float, movie: NoMovie = NO_MOVIE) -> Result:
+def design(prepared: PreparedDesign, device: str, say: Reporter, began: Start, movie: NoMovie = NO_MOVIE) -> Result:
     """Run a new design from its initial heights to its end; movie: records it.
 
     A finished design found by `prepare` is returned; an unfinished one is continued.
@@ -199,7 +201,7 @@ def design(prepared: PreparedDesign, device: str, say: Reporter, began: float, m
         return _run(project, problem, Designer(problem).initial_state(*first or ()), say, began, None, movie)
 
 
-def _again(project: Project, device: str, say: Reporter, began: float, movie: NoMovie) -> Result:
+def _again(project: Project, device: str, say: Reporter, began: Start, movie: NoMovie) -> Result:
     """The result of a design found by `prepare`."""
     figures = uptodate.finished(project, project.checkpoint)
     anew = kind_of(project.settings).no_resume
@@ -246,7 +248,7 @@ def resume(
     time_limit: float | None,
     device: str,
     say: Reporter,
-    began: float,
+    began: Start,
     movie: NoMovie = NO_MOVIE,
 ) -> Result:
     """Continue from the last checkpoint; with nothing left to do, evaluate the lens again."""
@@ -393,13 +395,22 @@ def _room(given: LensSettings, said: Given, first: torch.Tensor) -> dict[str, An
 class _Watch:
     """Called after every iteration of a design: progress, movie and checkpoints."""
 
-    def __init__(self, project: Project, designer: Designer, records: _Records, say: Reporter, movie: NoMovie):
+    def __init__(
+        self, project: Project, designer: Designer, records: _Records, say: Reporter, movie: NoMovie, began: Start, state: State
+    ):
         self.designer, self.records, self.say, self.movie = designer, records, say, movie
         self.chosen, self.encoding = project.settings.design, project.settings.target.encoding
         self.target = designer.problem.target.numpy()
-        self.total = self.chosen.iterations or sum(s.iterations for s in designer.stages)
+        lasting = [s for s in designer.stages if not s.spare] or designer.stages
+        self.total = self.chosen.iterations or sum(s.iterations for s in lasting)
         self.stage, self.saved = -1, time.monotonic()
         self.show: Callable[..., None] = lambda *progress: None
+        error_of, count = partial(designer.problem.error_of, designer), designer.problem.effort.cost_points
+        self.cost = CostOfAccuracy(began, error_of, self.total, count, state.accuracy)
+
+    def measure(self, now: State) -> None:
+        """Measure the error of the lens, unless that of this iteration is known."""
+        now.accuracy = list(self.cost.measure(now.total, now))
 
     def __call__(self, now: State) -> None:
         stages, stage = self.designer.stages, self.designer.stages[now.stage]
@@ -410,11 +421,14 @@ class _Watch:
         _, _, loss, on_screen, _ = now.history[-1]
         self.show(name, f"loss {loss * grey(self.target).size:.4f}  on screen {on_screen:.1%}", now.total, self.total)
         self.movie.record(now, self.target, self.encoding, bool(stage.waves))
+        if now.total in self.cost.due:
+            self.measure(now)
         self.keep_if_due(now)
 
     def keep_if_due(self, now: State) -> None:
         """Write a checkpoint if the last one is old enough."""
         if time.monotonic() - self.saved >= max(self.chosen.checkpoint_every, RARELY * (self.records.seconds - QUICK)):
+            self.measure(now)
             self.saved = time.monotonic()  # before writing, which takes time itself
             self.records.keep(now)
 
@@ -424,7 +438,7 @@ def _run(
     problem: OneSurface,
     state: State,
     say: Reporter,
-    began: float,
+    began: Start,
     time_limit: float | None,
     movie: NoMovie = NO_MOVIE,
 ) -> Result:
@@ -432,13 +446,14 @@ def _run(
     limit = chosen.time_limit if time_limit is None else time_limit
     timed = math.isfinite(limit)
     if timed:  # the limit includes the initial surface and the evaluation
-        limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - expected_seconds(designer, state))
+        limit = max(LEAST_PART * limit, limit - began.seconds - expected_seconds(designer, state))
     records = _Records(project, designer)
-    watch = _Watch(project, designer, records, say, movie)
+    watch = _Watch(project, designer, records, say, movie, began, state)
     movie.begin(problem.scene)
     prepare_report(project, designer)
     with announce_compilation(say, COMPILING), _signals(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
+            watch.measure(state)
             records.keep(state)
             ranks.send((project.settings, project.picture, _on_cpu(state), limit))
             state = designer.run(
@@ -461,6 +476,7 @@ def _run(
                     128 + asked[0],
                 )
             watch.keep_if_due(state)
+            watch.measure(state)
             state.heights = rounded(designer.within_limits(state))
         with say.waiting("evaluation with independent rays", evaluation_seconds(designer, state)):
             evaluated = evaluate_and_write(project, designer, state, timed)
@@ -474,13 +490,13 @@ def _run(
     return result
 
 
-def _run_index(project: Project, problem: OneSurface, say: Reporter, began: float) -> Result:
+def _run_index(project: Project, problem: OneSurface, say: Reporter, began: Start) -> Result:
     """Design a free gradient index, evaluate and save it."""
     chosen, lens = project.settings.design, project.settings.lens
     with _signals(project.path is not None) as asked:
         say.say(problem.words(lens))
         with say.progress(chosen.iterations or problem.stages[-1].iterations) as show:
-            values, state = problem.iterate(lens, chosen.iterations, began, chosen.time_limit, lambda: bool(asked), show)
+            values, state = problem.iterate(lens, chosen.iterations, began.wall, chosen.time_limit, lambda: bool(asked), show)
         lens = lens.changed(index_file=attachments.index_attached(values))
         project = replace(project, settings=project.settings.changed(lens=lens))
         if project.path is not None:
@@ -495,12 +511,17 @@ def _run_index(project: Project, problem: OneSurface, say: Reporter, began: floa
 
 
 def _finished(
-    project: Project, designer: Designer, evaluated: Evaluated, more: dict[str, Any], began: float, records: _Records
+    project: Project, designer: Designer, evaluated: Evaluated, more: dict[str, Any], began: Start, records: _Records
 ) -> Result:
     """The result of an evaluated design, with `more` figures, which is saved."""
     state = evaluated.state
     figures = evaluated.figures | more
-    figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "reason": state.reason}
+    figures |= {
+        "accuracy_cost": as_table(state.accuracy),
+        "iterations": state.total,
+        "seconds": began.seconds,
+        "reason": state.reason,
+    }
     if project.path is not None:
         figures |= uptodate.made_by(project, figures.get("wave_relative_rms") is not None)
     records.keep(state, figures)

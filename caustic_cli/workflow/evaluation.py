@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import torch
 
+from caustic_cli.inverse.accuracy_cost import price
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import discard
@@ -71,6 +72,8 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
         encoding,
         None if evaluated.waves is None else grey(evaluated.waves),
         [(stage.rendering.blur, bool(stage.waves)) for stage in designer.stages],
+        [(row.seconds, row.error) for row in state.accuracy],
+        price(state.accuracy),
         [None if a is None else partial(in_colour, scene, a) for a in (xyz, evaluated.waves_xyz)],
     )
     return evaluated

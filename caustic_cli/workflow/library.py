@@ -13,7 +13,6 @@ Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts; a
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
@@ -26,6 +25,7 @@ from torch import Tensor
 
 from caustic_cli.config import keywords
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture
 from caustic_cli.optics.emission import rays_of
@@ -140,7 +140,7 @@ def design_of(
     Raises:
         InputError, CausticError: as in `design`.
     """
-    began, recording = time.monotonic(), recorder(movie, force)
+    began, recording = Start.now(), recorder(movie, force)
     prepared = workflow.prepare(
         Path(target) if isinstance(target, str) else target,
         given,
@@ -174,7 +174,7 @@ def resume(
     Raises:
         InputError: there is no project, or it was edited into another design.
     """
-    began, say, recording = time.monotonic(), say or Listener(), recorder(movie, force)
+    began, say, recording = Start.now(), say or Listener(), recorder(movie, force)
     return _lens(workflow.resume(Project.open(path), iterations, time_limit, device, say, began, recording), device)
 
 

@@ -1,0 +1,104 @@
+"""What accuracy costs: the error of a lens against time and processor time, measured while its design runs.
+
+The error is judged by light that the optimiser does not use, as that of the finished lens is, but with less of it: see
+`kinds.OneSurface.error_of`.  These measurements are not part of the times.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+#: Rows at the end of a design whose slope gives the price of a smaller error; the reduction that is priced; and the exponent of the
+#: error in time below which it no longer decreases.
+LATEST, LESS, FLAT = 4, 0.1, 0.02
+
+
+class Start(NamedTuple):
+    """When a design was begun, by the clocks of wall time and of processor time, s."""
+
+    wall: float
+    processor: float
+
+    @classmethod
+    def now(cls) -> Start:
+        """This moment."""
+        return cls(time.monotonic(), time.process_time())
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since, s."""
+        return time.monotonic() - self.wall
+
+    @property
+    def processor_seconds(self) -> float:
+        """Processor time of this process since, of all its threads, s."""
+        return time.process_time() - self.processor
+
+
+class Row(NamedTuple):
+    """The error after an iteration, and wall and processor time from the beginning of the design until then, s."""
+
+    iteration: int
+    seconds: float
+    processor_seconds: float
+    error: float
+
+
+def iterations_to_measure(total: int, count: int) -> frozenset[int]:
+    """`count` iterations from 0 to `total`, in geometric progression as far as these differ; all of them if they are fewer."""
+    chosen = {0, total, *(round(total ** (k / max(1, count - 2))) for k in range(count - 1))}
+    others = (k for k in range(total) if k not in chosen)
+    while len(chosen) < min(count, total + 1):
+        chosen.add(next(others))
+    return frozenset(chosen)
+
+
+class CostOfAccuracy:
+    """Measures the error of a running design, and keeps the rows.
+
+    error_of: the error of a lens, None where there is none; total: iterations expected; count: rows wanted; earlier: the rows of
+    the run that is resumed, if any.
+    """
+
+    def __init__(self, start: Start, error_of: Callable[[Any], float | None], total: int, count: int, earlier: Iterable[Row]):
+        self.start, self.error_of, self.due = start, error_of, iterations_to_measure(total, count)
+        self.rows = list(earlier)
+        before = self.rows[-1] if self.rows else Row(0, 0.0, 0.0, 0.0)
+        self._offset = before.seconds, before.processor_seconds  # less what the measurements took
+
+    def measure(self, iteration: int, lens: Any) -> list[Row]:
+        """Measure the lens after an iteration, unless that was done; all rows."""
+        if not self.rows or self.rows[-1].iteration < iteration:
+            wall, processor = (a + b for a, b in zip(self._offset, (self.start.seconds, self.start.processor_seconds), strict=True))
+            if (error := self.error_of(lens)) is not None:
+                self.rows.append(Row(iteration, wall, processor, error))
+            self._offset = wall - self.start.seconds, processor - self.start.processor_seconds
+        return self.rows
+
+
+def price(rows: Sequence[Row]) -> str:
+    """What a smaller error would cost, in one sentence, extrapolated from the last rows: a power of the time from the initial lens;
+    "" for fewer than three rows."""
+    if len(rows) < 3:
+        return ""
+    last, first = rows[-1], rows[0]
+    latest = [row for row in rows[-LATEST:] if row.seconds > first.seconds]
+    spent = np.array([row.seconds - first.seconds for row in latest])
+    errors = np.array([row.error for row in latest])
+    if len(latest) < 2 or not (errors > 0).all():
+        return ""
+    exponent = -float(np.polyfit(np.log(spent), np.log(errors), 1)[0])
+    if exponent < FLAT:
+        return f"Further iterations of these stages would not lower the error of {last.error:.3g}."
+    more = (spent[-1]) * math.expm1(-math.log1p(-LESS) / exponent)
+    return f"The next {LESS:.0%} of the error of {last.error:.3g} would cost about {more:.2g} s more in these stages."
+
+
+def as_table(rows: Iterable[Row]) -> list[dict[str, Any]]:
+    """The rows for JSON."""
+    return [row._asdict() for row in rows]

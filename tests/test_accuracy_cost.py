@@ -1,0 +1,69 @@
+"""The error against time that a design keeps."""
+
+import json
+
+import pytest
+
+from caustic_cli import cli
+from caustic_cli.inverse import accuracy_cost
+from caustic_cli.inverse.accuracy_cost import CostOfAccuracy, Row, Start, iterations_to_measure, price
+
+
+@pytest.mark.parametrize("total", [1, 2, 5, 7, 8, 12, 40, 92, 1000])
+@pytest.mark.parametrize("count", [3, 8])
+def test_measured_iterations(total, count):
+    found = sorted(iterations_to_measure(total, count))
+    assert found[0] == 0 and found[-1] == total and len(found) == min(count, total + 1)
+
+
+def test_measuring_is_no_part_of_the_time(monkeypatch):
+    now = {"wall": 100.0, "processor": 10.0}
+    monkeypatch.setattr(accuracy_cost.time, "monotonic", lambda: now["wall"])
+    monkeypatch.setattr(accuracy_cost.time, "process_time", lambda: now["processor"])
+
+    def later(wall, processor):
+        now["wall"] += wall
+        now["processor"] += processor
+
+    def error_of(lens):
+        later(7.0, 9.0)
+        return lens
+
+    cost = CostOfAccuracy(Start.now(), error_of, 10, 9, [])
+    later(1.0, 2.0)
+    cost.measure(0, 0.4)
+    later(2.0, 3.0)
+    cost.measure(1, 0.3)
+    cost.measure(1, 0.2)  # known
+    cost.measure(2, None)  # no image
+    later(0.5, 0.5)
+    rows = cost.measure(3, 0.1)
+    assert rows == [Row(0, 1.0, 2.0, 0.4), Row(1, 3.0, 5.0, 0.3), Row(3, 3.5, 5.5, 0.1)]
+    resumed = CostOfAccuracy(Start.now(), error_of, 10, 9, rows)
+    later(1.0, 1.0)
+    assert resumed.measure(4, 0.05)[-1] == Row(4, 4.5, 6.5, 0.05)
+
+
+def test_the_price_of_a_smaller_error():
+    rows = [Row(0, 2.0, 2.0, 1.0), *(Row(k, 2.0 + t, 2.0, t**-0.5) for k, t in enumerate((1.0, 2.0, 4.0, 8.0), 1))]
+    assert "about 1.9 s more" in price(rows)  # 8 (0.9^-2 - 1)
+    assert "not lower" in price([row._replace(error=0.3) for row in rows])
+    assert price(rows[:2]) == ""
+
+
+def test_a_design_keeps_its_curve(tmp_path, capsys):
+    def figures_of(*arguments):
+        assert cli.run(["design", *arguments, "--json", "-q"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    out = tmp_path / "a.caustic"
+    figures = figures_of("examples/flame.png", "--resolution", "32", "--waves", "off", "--control", "35", "-o", str(out))
+    rows = figures["accuracy_cost"]
+    assert rows[0]["iteration"] == 0 and rows[-1]["iteration"] == figures["iterations"]
+    for key in ("seconds", "processor_seconds"):
+        times = [row[key] for row in rows]
+        assert times == sorted(times) and times[0] > 0 and times[-1] < figures["seconds"] * 4
+    assert rows[-1]["error"] == pytest.approx(figures["relative_rms"], rel=0.3) and rows[-1]["error"] < rows[0]["error"]
+    resumed = figures_of("--resume", str(out), "--iterations", "40")
+    assert resumed["accuracy_cost"][: len(rows)] == rows
+    assert resumed["accuracy_cost"][-1]["iteration"] == resumed["iterations"]
