@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -52,6 +53,21 @@ class DesignOptions(options.Computation):
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Project directory.  [default: TARGET's stem + .caustic, here]"),
     ] = None
+    plan: Annotated[
+        bool,
+        typer.Option(
+            "--plan", help="Design nothing: print error, seconds and memory to expect of draft, standard and fine on this machine."
+        ),
+    ] = False
+    error: Annotated[
+        float | None,
+        typer.Option(
+            metavar="E",
+            help="Take the cheapest quality that should reach this relative RMS error, judged by light that the optimiser does not"
+            " use; stop as soon as it does; go on with the next quality if it does not.",
+            show_default=False,
+        ),
+    ] = None
     movie: Annotated[
         Path | None,
         typer.Option(
@@ -83,6 +99,9 @@ def run(asked: DesignOptions) -> None:
     from caustic_cli.workflow import library  # noqa: PLC0415
     from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
+    if asked.plan:
+        _print_plan(asked, picture)
+        return
     with _saying_what_is_kept(project if asked.resume else path), ranks.process_group(device) as rank:
         if rank > 0:
             follow(device)
@@ -92,7 +111,8 @@ def run(asked: DesignOptions) -> None:
             iterations, time_limit = (asked.given.get(setting) for setting in CONTINUED)
             lens = library.resume(project, iterations=iterations, time_limit=time_limit, **how)
         else:
-            lens = library.design_of(picture, asked.given, preset=asked.preset, config=asked.config, out=path, **how)
+            how |= {"preset": asked.preset, "config": asked.config, "out": path}
+            lens = library.design_of(picture, asked.given, error=asked.error, **how)
     say.table(lens.figures["project"], console.figures_rows(lens.figures))
     if asked.json:
         console.emit_json(lens.figures)
@@ -105,11 +125,35 @@ def _check(asked: DesignOptions) -> None:
         raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
+    if asked.error is not None and not 0 < asked.error < math.inf:
+        raise InputError(f"--error must be greater than 0, got {asked.error:g}")
+    if (asked.plan or asked.error is not None) and (names := [n for n in ("quality", "rays") if n in asked.given]):
+        raise InputError(f"--{names[0]} is what {'--plan compares' if asked.plan else '--error chooses'}: leave it out")
+    if asked.plan and asked.error is not None:
+        raise InputError("--plan designs nothing, so --error has no meaning beside it: leave one out")
     if asked.resume and (names := _beside_resume(asked)):
         raise InputError(
             f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
             " --iterations and --time-limit can, and project.toml can be edited"
         )
+
+
+def _print_plan(asked: DesignOptions, picture: Any) -> None:
+    """Print what each quality would cost."""
+    from caustic_cli.workflow.estimate import plans  # noqa: PLC0415
+
+    found = list(plans(picture, asked.given, preset=asked.preset, config=asked.config))
+    rows = [("quality", "judged by", "error", "two of three", "seconds", "memory", "project", "no lens below")]
+    for e in found:
+        sizes = f"{e.memory_mib / 1024:.1f} GiB", f"{e.project_mib:.0f} MiB"
+        between = f"{e.low:.2g} to {e.high:.2g}"
+        rows.append((e.quality, e.error_by, f"{e.relative_rms:.2g}", between, f"{e.seconds:.0f}", *sizes, f"{e.bound:.2g}"))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    asked.say.result(*("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows))
+    if len({e.error_by for e in found}) > 1:
+        asked.say.result("by rays: with --waves off, which leaves diffraction out")
+    if asked.json:
+        console.emit_json({"plan": [row._asdict() for row in found]})
 
 
 def _check_before_torch(asked: DesignOptions, project: Path) -> Any:
@@ -174,5 +218,6 @@ def _saying_what_is_kept(project: Path):
 def _beside_resume(asked: DesignOptions) -> list[str]:
     """Names of the given options that cannot be combined with --resume."""
     others = [TABLE[path].option for path in asked.given if path not in CONTINUED]
-    files = [f"--{name}" for name in ("preset", "config") if getattr(asked, name) is not None]
+    files = [f"--{name}" for name in ("preset", "config", "error") if getattr(asked, name) is not None]
+    files += ["--plan"] if asked.plan else []
     return [*(option.name for option in others if option), *files]

@@ -30,7 +30,7 @@ PLACED = {
     **dict.fromkeys(("mag", "margin", "invert"), "Picture"),
     "element": "Lens",
     **dict.fromkeys(("throw", "screen_size", "resolution", "screen_at"), "Screen"),
-    **dict.fromkeys(("quality", "rays", "config", "preset", "resume", "robust"), "Design"),
+    **dict.fromkeys(("quality", "rays", "config", "preset", "plan", "error", "resume", "robust"), "Design"),
     **dict.fromkeys(("absorption", "roughness", "polarisation", "wavelengths", "waves", "effects", "explain"), "Effects"),
     **dict.fromkeys(("tolerance", "reconstruction", "filter_size", "alpha"), "Image"),
 }

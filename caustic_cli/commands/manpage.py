@@ -1,7 +1,7 @@
 """The manual pages: those of the commands, generated from the parser, and that of project.toml, from the table of settings.
 
 `python -m caustic_cli.commands.manpage man` writes caustic.1, a page for each command, and caustic-project.5, the reference of
-all settings, and the matrix of capabilities in the guide.  The hand-written sections are below.
+all settings, and the tables of capabilities in the guide and README.md.  The hand-written sections are below.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from caustic_cli.errors import plain_name
 from caustic_cli.io.files import read_bytes, write_bytes
 from caustic_cli.scene import materials
 from caustic_cli.schema.table import TABLE, Setting
-from caustic_cli.workflow.capabilities import matrix
+from caustic_cli.workflow.capabilities import limits, matrix
 
 HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"
 .SH NAME
@@ -132,6 +132,10 @@ the root mean square of its angular deviation.
 .B wave_wavelengths, wave_spectrum, wave_detector, wave_spectral_error
 Wavelengths of the wave image, nm; the continuous spectrum that they represent and by what it is measured, eye or power, null for
 spectral lines; and an estimate of the error of wave_relative_rms that their number leaves.
+.TP
+.B plan
+Of design \-\-plan: rows of quality, error_by, relative_rms to expect, low and high, the range of two designs of three, seconds,
+memory_mib, project_mib, and bound, the error below which diffraction lets no lens come.
 .TP
 .B accuracy_cost
 Of a design: rows of iteration, seconds and processor_seconds since its beginning, and error, measured at eight or more iterations
@@ -355,15 +359,15 @@ def _plain(text: str) -> str:
     return "\\&" + text if text[:1] in (".", "'") else text
 
 
-#: Chapter of the guide with the matrix of capabilities, beside the directory of the pages; what precedes and follows that there.
-GUIDE = "examples/guide/8-how-it-works.md"
+#: Documents with generated tables of capabilities, beside the directory of the pages; what precedes and follows these there.
+DOCUMENTS = {"examples/guide/8-how-it-works.md": matrix, "README.md": limits}
 BEGIN, END = "<!-- capabilities: generated with the manual pages -->\n\n", "\n\n<!-- end of capabilities -->"
 
 
-def guide(chapter: str) -> str:
-    """The chapter with the matrix as it is today."""
-    head, rest = chapter.split(BEGIN)
-    return head + BEGIN + matrix() + END + rest.split(END)[1]
+def document(name: str, text: str) -> str:
+    """A document with its table as it is today."""
+    head, rest = text.split(BEGIN)
+    return head + BEGIN + DOCUMENTS[name]() + END + rest.split(END)[1]
 
 
 if __name__ == "__main__":
@@ -371,5 +375,6 @@ if __name__ == "__main__":
         raise SystemExit("usage: python -m caustic_cli.commands.manpage DIRECTORY")
     for file, page in pages().items():
         write_bytes(Path(sys.argv[1]) / file, page.encode())
-    if (chapter := Path(sys.argv[1]).resolve().parent / GUIDE).exists():
-        write_bytes(chapter, guide(read_bytes(chapter, 1_000_000, "the guide is needed").decode()).encode())
+    for name in DOCUMENTS:
+        if (path := Path(sys.argv[1]).resolve().parent / name).exists():
+            write_bytes(path, document(name, read_bytes(path, 1_000_000, "the documents are needed").decode()).encode())

@@ -39,7 +39,7 @@ def wave_stages(s: Settings, source: Source, effort: Effort, lit: tuple[float, f
         return []
     light = build_light(s)
     own, whole = tuple(map(float, s.source.get("wavelengths", ()))), light.continuum
-    plan = wave_refinement(_wave_samples(s, seen, lit), len(own), effort, timed=asked == "auto")
+    plan = wave_refinement(wave_samples(s, seen, lit), len(own), effort, timed=asked == "auto")
     apron = math.ceil(0.04 * max(screen.resolution))
     return [on_waves(lens.control, own if own or whole is None else whole.rule(count)[0], apron, n) for count, n in plan]
 
@@ -50,7 +50,7 @@ def _resolution(s: Settings, source: Source) -> Resolution:
     return Resolution.before(scene, s.target.size)
 
 
-def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
+def wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
     """Estimated number of samples of the field at one wavelength: space-bandwidth product of the lens and the blurred bright
     region."""
     throw, shortest = abs(s.screen.z), min(build_light(s).lines()[0]) * 1e-6

@@ -120,11 +120,10 @@ def write_report(
     figure = Figure(figsize=(22.0, 9.8))
     axes = figure.subplots(2, 4, gridspec_kw=PLACES)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
-    shown = _images(image, waves, figures, colours)
-    _draw_images(axes[0], target, shown, figures, extent, encoding)
-    _draw_error(axes[0, len(shown) + 1], target, image if waves is None else waves, extent)
-    if len(shown) == 1:
-        _draw_section(axes[0, 3], target, image, screen)
+    judged = image if waves is None else waves
+    _draw_images(axes[0], target, _judged(judged, waves is not None, figures, colours), figures, extent, encoding)
+    _draw_error(axes[0, 2], target, judged, extent)
+    _draw_section(axes[0, 3], target, judged, screen)
     rx, ry = lens.half_size
     volume = None if lens.gradient is None else lens.gradient.volume
     relief, unit, name = (
@@ -144,40 +143,34 @@ def write_report(
         figure.savefig(file, format="png", dpi=100, metadata={"Software": SOFTWARE})
 
 
-def _images(image: np.ndarray, waves: np.ndarray | None, figures: dict, colours: Sequence[Colours | None]) -> list[Shown]:
-    """What is drawn, the image that judges the lens last."""
-
-    def absolute(picture: np.ndarray, title: str, prefix: str, colours: Colours | None) -> Shown:
-        error, scale = figures[f"{prefix}relative_rms"], figures[f"{prefix}peak_irradiance"] / (picture.max() or 1.0)
-        words = title if error is None else f"{title}\nrelative RMS error {error:.3f}"
-        if figures.get(f"{prefix}ciede2000") is not None:
-            words += f", CIEDE2000 {figures[f'{prefix}ciede2000']:.1f}"
-        if colours is None or not scale > 0:
-            return Shown(picture * scale, words, prefix)
-        return Shown(picture * scale, words, prefix, lambda white: colours(white / scale) / (white / scale))
-
-    if waves is not None:
-        return [absolute(image, "ray image", "", colours[0]), absolute(waves, "wave image", "wave_", colours[1])]
-    judged = absolute(image, "caustic", "", colours[0])
-    least = f", at least {figures['least_relative_rms']:.3f}" if "least_relative_rms" in figures else ""
-    return [judged._replace(title=judged.title + least)]
+def _judged(picture: np.ndarray, by_waves: bool, figures: dict, colours: Sequence[Colours | None]) -> Shown:
+    """The image that judges the lens.  That of a lens refined on its wave image by rays is none that light will show."""
+    prefix, own = JUDGES[by_waves].prefix, colours[by_waves]
+    error, scale = figures[f"{prefix}relative_rms"], figures[f"{prefix}peak_irradiance"] / (picture.max() or 1.0)
+    title = "wave image" if by_waves else "caustic"
+    words = title if error is None else f"{title}\nrelative RMS error {error:.3f}"
+    if figures.get(f"{prefix}ciede2000") is not None:
+        words += f", CIEDE2000 {figures[f'{prefix}ciede2000']:.1f}"
+    if "least_relative_rms" in figures and not by_waves:
+        words += f", at least {figures['least_relative_rms']:.3f}"
+    if own is None or not scale > 0:
+        return Shown(picture * scale, words, prefix)
+    return Shown(picture * scale, words, prefix, lambda white: own(white / scale) / (white / scale))
 
 
 def _draw_images(
     axes: Sequence[Axes],
     target: np.ndarray,
-    shown: list[Shown],
+    shown: Shown,
     figures: dict,
     extent: Sequence[float],
     encoding: str,
 ) -> None:
-    """The target and the images; the target and the one that judges the lens at the same exposure."""
-    judged = shown[-1].picture
-    goal = target * (judged.sum() / target.sum())
-    white = max(float(goal.max()), float(judged.max()))  # of both
-    for axis, (picture, title, prefix, colours) in zip(axes, [Shown(goal, "target", None), *shown], strict=False):
-        top = white if picture is goal or picture is judged else float(picture.max())
-        top = top if top > DARK else 1.0
+    """The target and the image that judges the lens at the same exposure."""
+    goal = target * (shown.picture.sum() / target.sum())
+    white = max(float(goal.max()), float(shown.picture.max()))  # of both
+    top = white if white > DARK else 1.0
+    for axis, (picture, title, prefix, colours) in zip(axes, (Shown(goal, "target", None), shown), strict=False):
         norm = (
             FuncNorm((lambda e, w=top: to_srgb(e / w), lambda v, w=top: w * to_linear(v)), 0.0, top, clip=True)
             if encoding == "srgb"

@@ -50,3 +50,14 @@ def matrix() -> str:
             alike.setdefault(tuple(name for name in TRAITS if name in one.unsupported), []).append(one.name)
     rows = [f"| {', '.join(names)} | {', '.join(TRAITS[name].words for name in traits)} |" for traits, names in alike.items()]
     return "\n".join(["| capability | not for |", "| --- | --- |", *rows])
+
+
+def limits() -> str:
+    """The same by what a scene has, as a table in Markdown: a row for what excludes the same capabilities."""
+    excluded = {trait: [one.name for one in capabilities() if trait in one.unsupported] for trait in TRAITS}
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for trait, names in excluded.items():
+        if names:
+            alike.setdefault(tuple(names), []).append(TRAITS[trait].words)
+    rows = [f"| {', '.join(traits)} | {', '.join(names)} |" for names, traits in alike.items()]
+    return "\n".join(["| scenes with | are not supported by |", "| --- | --- |", *rows])

@@ -24,12 +24,13 @@ from caustic_cli.inverse.problem import Options, Problem
 from caustic_cli.inverse.schedule import LossImage, Stage
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.picture import Picture
-from caustic_cli.kinds import problem_of
+from caustic_cli.kinds import OneSurface, problem_of
 from caustic_cli.kinds.surface import NETWORK_CONTROL
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Scene
+from caustic_cli.schema.table import Parameters
 
 #: A comparison without a project: pixels across the screen, and control points, 64 spans and the degree.
 PIXELS, CONTROL = 96, 67
@@ -39,6 +40,8 @@ CELLS, DISC = 480, 0.8
 PARTS = (1, 2, 4)
 ENDLESS = 10**9
 TRANSPORT = "lbfgs, from transport"
+#: Default designs that are compared as well.
+QUALITIES = ("draft", "standard", "fine")
 
 
 class CachingDesigner(Designer):
@@ -61,7 +64,8 @@ class TimedDesign:
         CausticError: no light reaches the screen.
     """
 
-    def __init__(self, series: str, problem: Problem):
+    def __init__(self, series: str, problem: Problem, transport: bool = False):
+        self.transport = transport or series == TRANSPORT
         self.series, self.optimizer, self.network = series, problem.options.optimizer, problem.options.parametrisation.network
         self.designer, target = CachingDesigner(problem), problem.target
         self.designer.run(self._begin(target), iterations=1)  # warm-up: compilation and caches
@@ -70,10 +74,13 @@ class TimedDesign:
 
     def _begin(self, target: Tensor) -> State:
         """The initial state, with the time of its computation."""
-        if self.series != TRANSPORT:
+        if not self.transport:
             return self.designer.initial_state()
-        began = time.monotonic()
-        first = first_surface(self.designer.scene, target.numpy(), self.designer.field(0)).heights
+        began, problem = time.monotonic(), self.designer.problem
+        if isinstance(problem, OneSurface):
+            first = problem.transport(True, math.inf).heights
+        else:
+            first = first_surface(self.designer.scene, target.numpy(), self.designer.field(0)).heights
         return replace(self.designer.initial_state(first), seconds=time.monotonic() - began)
 
     @property
@@ -133,7 +140,21 @@ def timed_designs(
         project = Project(None, full, Picture(picture_of_disc(), "linear"))
     problem = problem_of(project, device)
     runs = [TimedDesign(name, problem.varied(*how)) for name, *how in variants(problem, project.settings, dtype, seed)]
+    if type(problem) is OneSurface and problem.options.parametrisation.free:
+        for quality in QUALITIES:
+            other = of_quality(project, quality)
+            runs.append(TimedDesign(quality, problem_of(other, device), other.settings.design.start == "transport"))
     return problem.scene, problem.target.numpy(), runs
+
+
+def of_quality(project: Project, quality: str) -> Project:
+    """The same design by rays, with control net and stages that are the default of a quality."""
+    s = project.settings
+    lens = {key: value for key, value in s.lens.items() if key != "control"}
+    given = {"source": dict(s.source), "lens": lens, "screen": dict(s.screen), "target": dict(s.target), "design": {"waves": "off"}}
+    picture = project.picture
+    full = complete(given, picture.aspect, Parameters(quality=quality), picture.lit, picture.gaps)
+    return replace(project, settings=full)
 
 
 def lens_of_disc() -> tuple[Scene, HeightField, Tensor]:

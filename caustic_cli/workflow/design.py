@@ -57,7 +57,8 @@ surfaces, manufacture = OnDemand("caustic_cli.io.surfaces"), OnDemand("caustic_c
 GROUND, NEARLY = 0.6, 0.98
 #: Reasons of termination after which the state of the optimiser, much larger than the lens, is not saved, unless the number of
 #: iterations was given: resuming then restarts the optimiser.
-DONE = ("iterations", "no progress")
+REACHED = "error reached"
+DONE = ("iterations", "no progress", REACHED)
 #: Fractions of a time limit: least for the iterations, whatever the initial surface took; and most for the initial surface.
 LEAST_PART, START_PART = 0.25, 0.3
 NO_MOVIE = NoMovie()
@@ -185,8 +186,10 @@ class Result:
     figures: dict[str, Any]
 
 
-def design(prepared: PreparedDesign, device: str, say: Reporter, began: Start, movie: NoMovie = NO_MOVIE) -> Result:
-    """Run a new design from its initial heights to its end; movie: records it.
+def design(
+    prepared: PreparedDesign, device: str, say: Reporter, began: Start, movie: NoMovie = NO_MOVIE, goal: float = 0.0
+) -> Result:
+    """Run a new design from its initial heights to its end; movie: records it; goal: independent error at which it ends.
 
     A finished design found by `prepare` is returned; an unfinished one is continued.
     """
@@ -198,7 +201,7 @@ def design(prepared: PreparedDesign, device: str, say: Reporter, began: Start, m
         if not problem.in_stages:
             return _run_index(project, problem, say, began)
         _say_limits(project, problem, first, say)
-        return _run(project, problem, Designer(problem).initial_state(*first or ()), say, began, None, movie)
+        return _run(project, problem, Designer(problem).initial_state(*first or ()), say, began, None, movie, goal)
 
 
 def _again(project: Project, device: str, say: Reporter, began: Start, movie: NoMovie) -> Result:
@@ -404,15 +407,28 @@ class _Watch:
         lasting = [s for s in designer.stages if not s.spare] or designer.stages
         self.total = self.chosen.iterations or sum(s.iterations for s in lasting)
         self.stage, self.saved = -1, time.monotonic()
+        self.now: State | None = None
         self.show: Callable[..., None] = lambda *progress: None
         error_of, count = partial(designer.problem.error_of, designer), designer.problem.effort.cost_points
         self.cost = CostOfAccuracy(began, error_of, self.total, count, state.accuracy)
 
     def measure(self, now: State) -> None:
         """Measure the error of the lens, unless that of this iteration is known."""
+        self.now = now
         now.accuracy = list(self.cost.measure(now.total, now))
 
+    def reaches(self, goal: float) -> bool:
+        """Whether the lens has at most this error, which is measured anew where the loss says that it may."""
+        now = self.now
+        if not goal or now is None or not now.accuracy:
+            return False
+        last, losses = now.accuracy[-1], {0: math.inf} | {row[0]: row[2] for row in now.history}
+        if last.iteration < now.total and last.error * losses[now.total] <= goal * losses[last.iteration]:
+            self.measure(now)
+        return now.accuracy[-1].iteration == now.total and now.accuracy[-1].error <= goal
+
     def __call__(self, now: State) -> None:
+        self.now = now
         stages, stage = self.designer.stages, self.designer.stages[now.stage]
         name = f"stage {now.stage + 1}/{len(stages)}"
         if now.stage != self.stage:
@@ -441,6 +457,7 @@ def _run(
     began: Start,
     time_limit: float | None,
     movie: NoMovie = NO_MOVIE,
+    goal: float = 0.0,
 ) -> Result:
     chosen, designer = project.settings.design, Designer(problem)
     limit = chosen.time_limit if time_limit is None else time_limit
@@ -460,10 +477,12 @@ def _run(
                 state,
                 iterations=chosen.iterations,
                 time_limit=limit,
-                stop=lambda: bool(asked),
+                stop=lambda: bool(asked) or watch.reaches(goal),
                 on_iteration=watch,
                 notice=say.say,
             )
+            if not asked and watch.reaches(goal):
+                state.reason = REACHED
             if not asked and not chosen.iterations and problem.options.parametrisation.free and state.reason in DONE:
                 start, sharp = (None if z is None else rounded(z) for z in (state.start, state.unrounded))
                 state = replace(state, start=start, unrounded=sharp, parameters={}, optimizer={})

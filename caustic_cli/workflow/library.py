@@ -28,6 +28,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -39,6 +40,8 @@ from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow.lens import Lens, Render, count, load
 from caustic_cli.workflow.movie import recorder
 from caustic_cli.workflow.reporter import Listener, Reporter
+
+estimate = OnDemand("caustic_cli.workflow.estimate")
 
 #: Progress callback of a design: stage, status, iterations done, and in total.
 Progress = Callable[[str, str, int | None, int | None], None]
@@ -127,6 +130,7 @@ def design_of(
     out: Path | None = None,
     force: bool = False,
     movie: Path | None = None,
+    error: float | None = None,
     say: Reporter,
     device: str = "cpu",
 ) -> Lens:
@@ -136,23 +140,23 @@ def design_of(
         preset: settings by name, see `config.presets`; config: a TOML file of further ones, which override those of the preset and
             are overridden by those `given`.
         out, force, movie, device: as in `design`; say: receives progress and messages.
+        error: design by the cheapest quality that should reach this relative RMS error, until it is reached; None for the settings.
 
     Raises:
         InputError, CausticError: as in `design`.
     """
     began, recording = Start.now(), recorder(movie, force)
-    prepared = workflow.prepare(
-        Path(target) if isinstance(target, str) else target,
-        given,
-        preset=preset,
-        config=config,
-        out=out,
-        force=force,
-        recorded=recording.recorded,
-        say=say,
-        device=device,
-    )
-    return _lens(workflow.design(prepared, device, say, began, recording), device)
+    read = Path(target) if isinstance(target, str) else target
+    how: dict[str, Any] = {"preset": preset, "config": config}
+    qualities = [None] if error is None else estimate.cheapest(read, given, error, say, **how)
+    for quality in qualities:
+        wanted = given if quality is None else {**given, "quality": quality}
+        prepared = workflow.prepare(read, wanted, **how, out=out, force=force, recorded=recording.recorded, say=say, device=device)
+        done = workflow.design(prepared, device, say, began, recording, error or 0.0)
+        if error is None or estimate.reached(done.figures, error, quality, say):
+            break
+        force = True  # it replaces the lens that was not good enough
+    return _lens(done, device)
 
 
 def resume(
