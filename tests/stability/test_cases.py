@@ -6,7 +6,9 @@ import json
 import pytest
 
 from caustic_cli import cli
+from caustic_cli.errors import InputError
 from caustic_cli.studies import stability
+from caustic_cli.workflow.convergence import STUDIES, StudyRequest
 
 
 @pytest.mark.parametrize("case", stability.CASES, ids=lambda case: case.family)
@@ -34,3 +36,9 @@ def test_a_broken_bound_and_an_infinite_error_end_with_status_1(tmp_path, monkey
 def test_rays_are_refused(tmp_path, capfd):
     assert cli.run(["convergence", "--study", "stability", "--rays", "100", "-o", str(tmp_path)]) == 2
     assert "--rays has no meaning" in capfd.readouterr().err
+
+
+def test_a_project_is_refused():
+    asked = StudyRequest(lens=object(), device="cpu", say=None, progress=None)
+    with pytest.raises(InputError, match="PROJECT has no meaning"):
+        STUDIES["stability"].measure(asked)
