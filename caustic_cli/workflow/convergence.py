@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from caustic_cli.errors import InputError
 from caustic_cli.schema import checks
 
 if TYPE_CHECKING:
@@ -77,6 +78,8 @@ class StudyKind:
     rays_of_all: ClassVar[bool] = False
     #: Whether its errors are those of lenses against the picture, as of a design; others compare images with each other.
     of_lenses: ClassVar[bool] = False
+    #: Whether it can study the lens of a project.
+    takes_project: ClassVar[bool] = True
     #: Messages for traits of scenes that it does not support, see `scene.traits`.
     unsupported: Mapping[str, str] = {"other elements": SINGLE}
 
@@ -106,7 +109,9 @@ class StudyKind:
         from caustic_cli.workflow.compilation import compile_usual  # noqa: PLC0415
 
         if asked.lens:
-            others = ", ".join(kind.name for kind in STUDIES.values() if "other elements" not in kind.unsupported)
+            others = ", ".join(
+                kind.name for kind in STUDIES.values() if kind.takes_project and "other elements" not in kind.unsupported
+            )
             self.capability.refuse(asked.lens.scene, study=self.name, others=others)
             if "other elements" in self.unsupported:
                 asked = replace(asked, lens=replace(asked.lens, scene=asked.lens.scene.unfolded))
@@ -215,6 +220,23 @@ class LightStudy(StudyKind):
         return self.module.run_efficiency(designed, count, rays=asked.rays, device=asked.device, **asked.seeds)
 
 
+class StabilityStudy(StudyKind):
+    """Numerically difficult cases, each with its own scene."""
+
+    name, home, unit = "stability", "stability", "cases"
+    takes_project = False
+    unsupported: Mapping[str, str] = {}
+
+    def measure(self, asked: StudyRequest) -> Study:
+        for option, value in (("PROJECT", asked.lens), ("⟨rays⟩", asked.rays)):
+            if value is not None:
+                raise InputError(f"{option} has no meaning for ⟨study⟩ stability, whose cases are given: leave it out")
+        return super().measure(asked)
+
+    def run(self, asked: StudyRequest) -> Study:
+        return self.module.run_stability(asked.progress)
+
+
 #: Every study by its name, in the order of `study all`; and that of networks, which is a variant of the study of designs.
 STUDIES: dict[str, StudyKind] = {
     kind.name: kind
@@ -225,6 +247,7 @@ STUDIES: dict[str, StudyKind] = {
         DesignStudy(),
         DiffractionStudy(),
         LightStudy(),
+        StabilityStudy(),
     )
 }
 NETWORKS = NetworkStudy()

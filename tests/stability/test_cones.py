@@ -43,23 +43,16 @@ def solid_angle(half_x: float, half_y: float, h: float):
 
 
 @pytest.mark.parametrize("cone", CONES)
-def test_part_of_a_cone_that_meets_the_lens(cone, compare):
+def test_part_of_a_cone_that_meets_the_lens(cone):
     """The cone's circle reaches 1.2 times as far as the lens' corner: the part is a ratio of solid angles."""
-    theta = math.radians(cone)
-    h = min(math.hypot(5.0, 4.0) / (math.tan(theta) / 1.2), 1e12)
+    h = min(math.hypot(5.0, 4.0) / (math.tan(math.radians(cone)) / 1.2), 1e12)
     exact = solid_angle(5.0, 4.0, h) / (4 * mp.pi * mp.sin(mp.radians(mp.mpf(cone)) / 2) ** 2)
-    ours = abs(arriving(scene(h, cone=cone)) / float(exact) - 1.0)
-    t = torch.tensor(theta, dtype=torch.float32)
-    whole = 2.0 * math.pi * (1.0 - torch.cos(t))
-    naive = abs(float(torch.tensor(float(solid_angle(5.0, 4.0, h))) / whole) / float(exact) - 1.0)
-    assert ours < 3e-4
-    if cone <= 1e-2:
-        compare("cones, 1e-6 to 89.999°", "power that meets the lens, relative", naive, ours, 1e-5)
+    assert abs(arriving(scene(h, cone=cone)) / float(exact) - 1.0) < 3e-4
 
 
 @pytest.mark.parametrize("intensity", ["uniform", "lambertian"])
 @pytest.mark.parametrize("distance", DISTANCES)
-def test_power_from_any_distance(distance, intensity, compare):
+def test_power_from_any_distance(distance, intensity):
     """A hemisphere: uniform light by the solid angle, Lambertian light by the integral of cos^2 / (pi r^2)."""
     found = arriving(scene(distance, cone=90.0, intensity=intensity))
     h = mp.mpf(distance)
@@ -69,14 +62,7 @@ def test_power_from_any_distance(distance, intensity, compare):
         x, y = 5 / h, 4 / h
         a, b = x / mp.sqrt(1 + x * x), y / mp.sqrt(1 + y * y)
         exact = 4 * (a * mp.atan(y / mp.sqrt(1 + x * x)) + b * mp.atan(x / mp.sqrt(1 + y * y))) / (2 * mp.pi)
-    side = (torch.arange(100, dtype=torch.float64) + 0.5) / 100 - 0.5
-    r2 = (10.0 * side[:, None]) ** 2 + (8.0 * side) ** 2 + distance**2
-    power = distance / r2**1.5 / (2.0 * math.pi) if intensity == "uniform" else distance**2 / r2**2 / math.pi
-    naive = abs(float(power.mean() * 80.0) / float(exact) - 1.0)
-    error = abs(found / float(exact) - 1.0)
-    assert error < 2e-3
-    if distance <= 1e-3:
-        compare("source 1e-6 to 1e6 mm before the lens", "power that meets the lens, relative", naive, error, 1e-3)
+    assert abs(found / float(exact) - 1.0) < 2e-3
 
 
 @pytest.mark.parametrize("aside", [3.0, 20.0, 1e4])
