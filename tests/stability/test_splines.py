@@ -5,7 +5,6 @@ coefficients cancel the more the higher the degree.
 """
 
 import functools
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -15,66 +14,15 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.studies.stability.splines import exact, heights_of, naive_basis, points, space
 
 SHARE = torch.ones((), dtype=torch.float64)
-
-
-def space(p: int, kind: str) -> SplineSpace:
-    if kind == "even":
-        return SplineSpace.uniform(p + 9, p)
-    inner = [0.25] * p + [0.25 + 1e-9] + [0.5] * max(1, p // 2) + [1.0 - 2.0**-30]  # repeated, nearly repeated, at the edge
-    return SplineSpace(p, torch.tensor([0.0] * (p + 1) + inner + [1.0] * (p + 1), dtype=torch.float64))
-
-
-def points(s: SplineSpace) -> torch.Tensor:
-    """Knots, the floats beside them, and points in between."""
-    b = s.breaks
-    beside = torch.cat([torch.nextafter(b, torch.zeros_like(b))[::2], torch.nextafter(b, torch.ones_like(b))[1::2]])
-    return torch.cat([b, beside, 0.5 * (b[1:] + b[:-1])[::2], torch.linspace(0.0, 1.0, 6, dtype=torch.float64)])
-
-
-def exact(s: SplineSpace, x: float, heights) -> tuple[float, float, float]:
-    """Value, slope and the sum of |N_i' P_i| of the spline at x, by rational arithmetic."""
-    t, p, x = [Fraction(float(k)) for k in s.knots], s.degree, Fraction(x)
-    last = max(i for i in range(len(t) - 1) if t[i] < t[i + 1])
-    span = min(max(i for i in range(len(t) - 1) if t[i] <= x), last)
-    n = [Fraction(int(i == span)) for i in range(len(t) - 1)]
-
-    def ratio(a, b):
-        return a / b if b else Fraction(0)
-
-    for k in range(1, p + 1):
-        before = n
-        n = [
-            ratio(x - t[i], t[i + k] - t[i]) * n[i] + ratio(t[i + k + 1] - x, t[i + k + 1] - t[i + 1]) * n[i + 1]
-            for i in range(len(n) - 1)
-        ]
-    slopes = [p * (ratio(before[i], t[i + p] - t[i]) - ratio(before[i + 1], t[i + p + 1] - t[i + 1])) for i in range(len(n))]
-    h = [Fraction(float(v)) for v in heights]
-    value, slope = (sum(a * b for a, b in zip(w, h, strict=True)) for w in (n, slopes))
-    return float(value), float(slope), float(sum(abs(a * b) for a, b in zip(slopes, h, strict=True)))
-
-
-def heights_of(n: int, seed: int) -> torch.Tensor:
-    """Numbers that float32 holds as they are."""
-    return torch.rand(n, generator=torch.Generator().manual_seed(seed)).double() - 0.5
 
 
 @functools.cache
 def exact_rows(p: int, kind: str) -> list[tuple[float, float, float]]:
     s = space(p, kind)
     return [exact(s, float(x), heights_of(s.n, p)) for x in points(s)]
-
-
-def naive_basis(s: SplineSpace, x: np.ndarray, dtype) -> np.ndarray:
-    """Cox-de Boor as it is written down, quotients and all."""
-    t, p = s.knots.numpy().astype(dtype), s.degree
-    x = x.astype(dtype)[:, None]
-    n = ((t[:-1] <= x) & (x < t[1:])).astype(dtype)
-    with np.errstate(all="ignore"):
-        for k in range(1, p + 1):
-            n = (x - t[: -k - 1]) / (t[k:-1] - t[: -k - 1]) * n[:, :-1] + (t[k + 1 :] - x) / (t[k + 1 :] - t[1:-k]) * n[:, 1:]
-    return n
 
 
 @pytest.mark.parametrize("kind", ["even", "repeated"])

@@ -12,11 +12,11 @@ from collections.abc import Callable
 from matplotlib.figure import Figure
 
 from caustic_cli.studies.report import COLOURS, Drawing, Study
-from caustic_cli.studies.stability import elements, light
+from caustic_cli.studies.stability import elements, images, light, splines, waves
 from caustic_cli.studies.stability.case import Case
 
 #: Every case, in the order of the table.
-CASES: tuple[Case, ...] = (*light.CASES, *elements.CASES)
+CASES: tuple[Case, ...] = (*light.CASES, *images.CASES, *splines.CASES, *elements.CASES, *waves.CASES)
 #: Errors below this are drawn at it.
 LEAST = 1e-17
 #: Columns of the table.
