@@ -69,6 +69,7 @@ def test_sections_in_the_usual_order():
         "COMMANDS",
         "FILES",
         "JSON",
+        "LIGHTTOOLS ARCHIVE",
         "ORIENTATION",
         "REPEATED COMMANDS",
         "COMPLETION",

@@ -16,6 +16,7 @@ from caustic_cli.commands.options import default_words
 from caustic_cli.commands.parser import parser
 from caustic_cli.config import presets
 from caustic_cli.errors import plain_name
+from caustic_cli.export.archive_keys import KEYS, Key
 from caustic_cli.io.files import read_bytes, write_bytes
 from caustic_cli.scene import materials
 from caustic_cli.schema.table import TABLE, Setting
@@ -162,7 +163,8 @@ Of
 .BR "\-\-glass list" " and " "\-\-preset list" ,
 the materials: name, n_d, its spread between batches, the Abbe number V_d, density (g/cm^3), steepest_slope (mm per mm), range_nm,
 source, other names (also); or the presets: name, purpose.
-.SH ORIENTATION
+"""
+AFTER_KEYS = r""".SH ORIENTATION
 Arrays are indexed [i, j], with i along +x and j along +y.  Image files show the screen as seen from +z: column 0 is the \-x edge,
 row 0 the +y edge.  Seen from the side of the lens the picture is mirrored;
 .B \-\-flip x
@@ -220,6 +222,16 @@ caustic export flame.caustic --format stl -o flame.stl
 caustic convergence flame.caustic --study rays
 .fi
 """
+#: What precedes the keys of an archive.
+ARCHIVE = r""".SH LIGHTTOOLS ARCHIVE
+.B caustic export \-\-format lighttools
+writes one .npz file, which
+.I numpy.load
+reads with allow_pickle=False, and which design (\-\-start) and render accept.  It holds the surface as a cloud of points and as the
+exact B\-spline, and the whole scene.  In shapes, letters are sizes: n x m control points, nx x ny points of the cloud, l
+wavelengths, g other elements; k, a and b differ from key to key.  Grids are indexed [i, j], with i along +x and j along +y.
+Numbers are float64, whole ones int64.
+"""
 
 
 def build() -> str:
@@ -228,7 +240,17 @@ def build() -> str:
     parts = [HEAD.format(version=__version__)]
     for name, command in root.commands.items():
         parts.append(_command(name, command))
-    return "".join(parts) + TAIL
+    return "".join(parts) + TAIL + _archive() + AFTER_KEYS
+
+
+def _archive() -> str:
+    """The keys of an archive, by the part of the scene."""
+    return ARCHIVE + "".join(f".SS {part}\n" + "".join(map(_key, keys)) for part, keys in KEYS.items())
+
+
+def _key(key: Key) -> str:
+    facts = ", ".join(filter(None, (key.shape, {"1": "no unit", "whole": "whole"}.get(key.unit, key.unit))))
+    return f".TP\n\\fB{_plain(key.name)}\\fR  {_plain(facts)}\n{_plain(key.meaning[0].upper() + key.meaning[1:])}.\n"
 
 
 REFERENCE = r""".TH CAUSTIC-PROJECT 5 "" "caustic {version}" "File Formats"

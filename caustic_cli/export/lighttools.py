@@ -2,7 +2,7 @@
 
 Lengths are mm, powers W (or lm), angles degrees.  Reals are float64, counts (`shape`, `resolution`, `degrees`,
 `format_version`) int64, names strings; `numpy.load` reads it with allow_pickle=False.  Grids are indexed [i, j], i
-along +x and j along +y, and flattened row-major: x varies slowest.
+along +x and j along +y, and flattened row-major: x varies slowest.  `archive_keys` lists every key for the manual.
 
 Arrays are compressed by deflate, those of points column by column, in a fixed order and without the time of writing.  The control
 points and the cloud of a large net are rounded by less than 0.05 nm, its normals by 1e-7, so that they can be compressed; those of

@@ -137,7 +137,8 @@ def reflectance(kind: str, c, s, eta: float | Tensor):
     """Reflectance from c and s of `refract` (up to a common factor); kind: none, schlick or exact, for unpolarised light.
 
     Exact: (r_s^2 + r_p^2) / 2 with r_s = (eta c - s) / (eta c + s), r_p = (c - eta s) / (c + eta s).
-    Schlick: R0 + (1 - R0) (1 - cos)^5 with the larger of the two angles, eqs. 2.1.13 and 2.1.14; it needs true cosines.
+    Schlick: R0 + (1 - R0) (1 - cos)^5 with the larger of the two angles; it needs true cosines.  Eqs. 2.1.13 and 2.1.14, errata
+    E17 and E18.
     """
     if kind == "none":
         return torch.zeros_like(s) if isinstance(s, Tensor) else 0.0

@@ -162,7 +162,7 @@ class Sampler:
     shape: tuple[int, int]
     #: Of the random kinds.
     seed: int = 0
-    #: Relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3).
+    #: Relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3, erratum E19).
     profile: Tensor | None = None
     #: Where the samples live.
     device: str | torch.device = "cpu"

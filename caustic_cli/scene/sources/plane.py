@@ -19,7 +19,7 @@ class PlaneWave(Source):
     #: Power through the aperture, W.
     power: float = 1.0
     #: Optional relative irradiance E over the aperture, (a, b) non-negative, [i, j] with i along +x and j along +y, constant on
-    #: each cell (eq. 4.2.3); None for uniform irradiance.
+    #: each cell (eq. 4.2.3, erratum E19); None for uniform irradiance.
     profile: np.ndarray | None = None
 
     kind = "plane"
