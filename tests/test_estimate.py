@@ -112,6 +112,12 @@ def test_a_design_for_an_error_takes_the_cheapest_and_stops_there(capfd, monkeyp
     found = figures_of(capfd, "--error", str(wanted), "--start", "offset", *SMALL)
     assert found["iterations"] > 0 and found["error"] <= wanted + found["noise"] and found["reason"].startswith("error reached")
     assert found["accuracy_cost"][-2]["error"] > wanted >= found["accuracy_cost"][-1]["error"]
+    further = figures_of(capfd, "--error", "0.25", "--start", "offset", *SMALL)  # goes on from there
+    assert further["iterations"] > found["iterations"] and further["error"] <= 0.25 + further["noise"]
+    assert further["accuracy_cost"][: len(found["accuracy_cost"])] == found["accuracy_cost"]
+    same = figures_of(capfd, "--error", "0.25", "--start", "offset", *SMALL)
+    assert same == further
+    found = further
     assert json.loads(json.dumps(Project.open("blob.caustic").load().results))["error"] == found["error"]
 
 

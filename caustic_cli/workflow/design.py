@@ -195,7 +195,7 @@ def design(
     """
     project, problem, first = prepared
     if problem is None:
-        return _again(project, device, say, began, movie)
+        return _again(project, device, say, began, movie, goal)
     with project.hold:
         _compile(problem, say)
         if not problem.in_stages:
@@ -204,9 +204,11 @@ def design(
         return _run(project, problem, Designer(problem).initial_state(*first or ()), say, began, None, movie, goal)
 
 
-def _again(project: Project, device: str, say: Reporter, began: Start, movie: NoMovie) -> Result:
+def _again(project: Project, device: str, say: Reporter, began: Start, movie: NoMovie, goal: float) -> Result:
     """The result of a design found by `prepare`."""
     figures = uptodate.finished(project, project.checkpoint)
+    if figures and figures["reason"].startswith(REACHED) and not figures["error"] <= goal:
+        figures = {}  # it ended for a larger error
     anew = kind_of(project.settings).no_resume
     say.say(
         f"{project.path}: was designed from the same picture with the same options, so "
@@ -223,7 +225,7 @@ def _again(project: Project, device: str, say: Reporter, began: Start, movie: No
         project = replace(project, asked=uptodate.asked_of(project, project.checkpoint), checkpoint=None)
         return design(PreparedDesign(project, problem_of(project, device)), device, say, began)
     if not figures:
-        return resume(project, None, None, device, say, began, movie)
+        return resume(project, None, None, device, say, began, movie, goal)
     movie.unused(say)
     scene = project.scene()
     target = project.target(scene)
@@ -253,6 +255,7 @@ def resume(
     say: Reporter,
     began: Start,
     movie: NoMovie = NO_MOVIE,
+    goal: float = 0.0,
 ) -> Result:
     """Continue from the last checkpoint; with nothing left to do, evaluate the lens again."""
     with project.hold:
@@ -276,7 +279,7 @@ def resume(
             project = replace(project, settings=project.settings.changed(design=changed))
             project.write_settings()
         project = replace(project, asked=uptodate.asked_of(project, checkpoint) if has_checkpoint else uptodate.begun(project))
-        return _run(project, problem, state, say, began, time_limit, movie)
+        return _run(project, problem, state, say, began, time_limit, movie, goal)
 
 
 def _compile(problem: OneSurface, say: Reporter) -> None:

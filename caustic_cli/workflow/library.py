@@ -145,12 +145,12 @@ def design_of(
     Raises:
         InputError, CausticError: as in `design`.
     """
-    began, recording = Start.now(), recorder(movie, force)
+    began = Start.now()
     read = Path(target) if isinstance(target, str) else target
     how: dict[str, Any] = {"preset": preset, "config": config}
     qualities = [None] if error is None else estimate.cheapest(read, given, error, say, **how)
     for quality in qualities:
-        wanted = given if quality is None else {**given, "quality": quality}
+        wanted, recording = given if quality is None else {**given, "quality": quality}, recorder(movie, force)
         prepared = workflow.prepare(read, wanted, **how, out=out, force=force, recorded=recording.recorded, say=say, device=device)
         done = workflow.design(prepared, device, say, began, recording, error or 0.0)
         if error is None or estimate.reached(done.figures, error, quality, say):
