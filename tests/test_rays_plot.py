@@ -80,6 +80,13 @@ def test_every_ray_is_counted_once_by_how_it_is_lost():
     assert lost.any() and (totally.vertices[lost, -1] == totally.vertices[lost, -2]).all()
 
 
+def test_rays_that_leave_by_the_sides_are_drawn_beside_the_exit():
+    paths = paths_of(200, source=SOURCES["point"])
+    ends = paths.vertices[paths.status == 3, -1]
+    assert len(ends) > 10 and np.abs(ends[:, 2] - 4.0).max() < 1.0
+    assert ((np.abs(ends[:, 0]) > 4.5) | (np.abs(ends[:, 1]) > 3.5)).all()
+
+
 def test_rays_end_on_a_tilted_screen_and_on_a_curved_one():
     """Its plane is turned about x; the sphere's sag is r - sqrt(r^2 - x^2 - y^2)."""
     tilted = paths_of(screen=replace(SCREEN, tilt=(30.0, 0.0))).vertices[:, -1]

@@ -44,6 +44,8 @@ WAYS = {
 #: Length by which light from infinity is drawn before the first surface, and a ray that leaves without an end, as a fraction of the
 #: distance between the first surface and the screen.
 STUB = 0.15
+#: Cosine to the normal of a plane below which a ray is not continued to it.
+GRAZING = 0.1
 #: Colours of rays on the screen and of lost ones.
 ARRIVED, LOST = "#3a6ea5", "#d1495b"
 
@@ -90,7 +92,8 @@ def trace_paths(
     """
     check_count(count)
     sampler = rays_of(scene, "sobol", (math.isqrt(count) + 1) ** 2, seed)  # a sampler in rows and columns may take fewer
-    found = list(_traced(tracers(scene, field, sampler, torch.float64, FEW, requests, track=True), {EXIT: heights}, scene))
+    made = tracers(scene, field, sampler, torch.float64, FEW, requests, track=True)
+    found = list(_traced(made, {EXIT: heights.detach().cpu()}, scene))
     vertices, status = (np.concatenate(part) for part in zip(*(one[:2] for one in found), strict=True))
     kept = np.unique(np.linspace(0, len(status) - 1, min(count, len(status))).round().astype(int))
     return Paths(vertices[kept], status[kept], found[0][2])
@@ -109,8 +112,9 @@ def _traced(made: Iterator[Tracer], parameters: dict[str, Tensor], scene: Scene)
         for m in interactions:
             state, before = m.state.expanded(), points[-1]
             now = np.where(status == RayStatus.OK, state.statuses().numpy(), status)
-            along = ((np.array(m.element.pose.position) - before) * direction).sum(1, keepdims=True)
-            missed = before + np.maximum(along, 0.0) * direction
+            met = _points(state)[now == RayStatus.OK]
+            middle = met.mean(0) if len(met) else np.array(m.element.pose.position)
+            missed = _to_plane(before, direction, middle, np.array(m.element.pose.axes[2]))
             hit = np.where((now == RayStatus.MISSED_SURFACE)[:, None], missed, _points(state))
             points.append(np.where((status == RayStatus.OK)[:, None], hit, before))
             status = now
@@ -122,6 +126,13 @@ def _traced(made: Iterator[Tracer], parameters: dict[str, Tensor], scene: Scene)
         points.append(np.where((status == RayStatus.OK)[:, None], end, points[-1]))
         corners = np.array(receiver.corners())[[0, 1, 3, 2]]
         yield np.stack(points, 1), np.where((now == RayStatus.OK) & beside, OFF_SCREEN, now), corners
+
+
+def _to_plane(points: np.ndarray, direction: np.ndarray, middle: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Where rays that miss a surface pass the plane through its middle, (N, 3) mm; the points of those that run along it."""
+    slant = direction @ normal
+    t = np.where(np.abs(slant) > GRAZING, (middle - points) @ normal / np.where(slant == 0.0, 1.0, slant), 0.0)
+    return points + np.maximum(t, 0.0)[:, None] * direction
 
 
 def _run_up(source: Source, points: np.ndarray, direction: np.ndarray, length: float) -> np.ndarray | float:
