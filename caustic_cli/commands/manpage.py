@@ -155,6 +155,10 @@ shifted_relative_rms (after the best shift of the screen) and on_target, sensiti
 For an array with a prescribed illumination: brightness of each lenslet's source relative to the largest, N lists of M; error, the
 relative RMS error of the resulting image; kkt_residual; power, as a fraction of what all sources would require; image.
 .TP
+.B rays_plot
+For a render with \-\-rays\-plot: rays drawn, lost, lost_by (numbers of rays by the way in which they are lost: missed_surface,
+total_internal_reflection, away_from_screen, off_screen), image.
+.TP
 .B rays, iterations, seconds, image, project
 Number of rays traced, number of iterations, wall time, paths of files.
 .TP

@@ -91,6 +91,14 @@ class OutputOptions(options.Given):
             " the caustic for movable screen and light, target and difference.",
         ),
     ] = None
+    rays_plot: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Also draw this many rays (1 to 2000) through the lens to the screen, from the side and in three dimensions, lost"
+            " ones in another colour; writes rays.png beside the image.",
+        ),
+    ] = None
     verify: Annotated[
         str | None,
         typer.Option(
@@ -201,7 +209,7 @@ def _checked_size(asked: RenderOptions) -> list[int]:
     radius = asked.tool_radius
     if radius is not None and not ((asked.report or asked.cut) and radius > 0):
         raise InputError(f"--tool-radius belongs to --report and --cut and must be greater than 0 mm, got {radius:g}")
-    designed = [name for name in ("verify", "explain", "html") if getattr(asked, name)]
+    designed = [option for option in ("verify", "explain", "html", "rays-plot") if getattr(asked, option.replace("-", "_"))]
     if asked.cut and designed:
         raise InputError(f"--cut goes without --{designed[0]}, which looks at the surface as designed")
     if asked.verify not in (None, "mitsuba"):

@@ -84,7 +84,7 @@ class Tracer:
         like: the tracer of the previous chunk through the same system, whose prepared arrays are reused where they are equal.
         weight, channel: fraction of the total power of this light, and its colour channel.
         wavelength: nm, at which the indices of glasses are evaluated; None for the indices of the media.
-        track: record the outcome of every ray (`RayState.status`).
+        track: record the outcome of every ray (`RayState.status`), and its way (`interactions`).
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Tracer:
         self._acting = EFFECTS.acting(system, requests)
         made = (effect.action(system, requests) for effect in self._acting)
         self.actions: tuple[Action, ...] = tuple(a for a in made if a is not None)
-        self.recorded = any(a.stray for a in self.actions)
+        self.recorded = track or any(a.stray for a in self.actions)
         self.fused: Fused | None = lowered(self, None if like is None else like.fused)
         #: Power through the pupil, (), where a fused pencil knows it without a trace of the rays in front of the lens.
         self.lit: Tensor | None = getattr(self.fused, "entering", None)
@@ -124,9 +124,7 @@ class Tracer:
     @cached_property
     def _front(self) -> Front:
         """The trace up to the first free-form surface, made when it is first asked for."""
-        rays, pupil, system = self.rays, self.system.pupil, self.system
-        state = rays.at_pupil() if isinstance(rays, Pencil) else rays
-        state = state if isinstance(state, RayState) else RayState.on_axis(state, pupil.half_size, pupil.z)
+        system, state = self.system, self.emitted
         state = replace(state, lost=dict(state.lost), wavelength=self.wavelength)
         for effect in self._acting:
             state = effect.prepare(system, state, self.requests)
@@ -144,6 +142,13 @@ class Tracer:
                     interactions.append(behind)
                 state, first = behind.state, first + 1
         return Front(state, first, interactions, behind, entering)
+
+    @property
+    def emitted(self) -> RayState:
+        """The rays in front of the first element."""
+        rays, pupil = self.rays, self.system.pupil
+        state = rays.at_pupil() if isinstance(rays, Pencil) else rays
+        return state if isinstance(state, RayState) else RayState.on_axis(state, pupil.half_size, pupil.z)
 
     @property
     def start(self) -> RayState:
@@ -209,6 +214,10 @@ class Tracer:
             interaction = self.trace_element(k, state, parameters.get(self.system.elements[k].name), parameters=parameters)
             yield interaction
             state = interaction.state
+
+    def interactions(self, parameters: Parameters) -> list[Interaction]:
+        """The direct light at every element; only of a tracer that tracks its rays."""
+        return [*self._front.interactions, *self._interactions(parameters)]
 
     def last(self, parameters: Parameters) -> Interaction:
         """The direct light at the last element."""

@@ -11,6 +11,7 @@ from caustic_cli.workflow.outputs.explanation import Explanation
 from caustic_cli.workflow.outputs.illumination import Illumination
 from caustic_cli.workflow.outputs.image import RayPicture
 from caustic_cli.workflow.outputs.page import InteractivePage
+from caustic_cli.workflow.outputs.rays_plot import RaysPlot
 from caustic_cli.workflow.outputs.report import ManufacturingReport
 from caustic_cli.workflow.outputs.second_target import SecondPicture
 from caustic_cli.workflow.outputs.tolerances import ToleranceAnalysis
@@ -29,6 +30,7 @@ OUTPUTS: tuple[type[Output], ...] = (
     ManufacturingReport,
     ToleranceAnalysis,
     Illumination,
+    RaysPlot,
     MitsubaComparison,
 )
 
