@@ -4,9 +4,9 @@ Cost model: the time of a design is the sum of the work of its parts (`work_of`:
 the time of a unit of each on a reference machine (`SECONDS`), times how much slower this machine is: `slowness` measures that in
 half a second and keeps it for an hour.  Memory likewise (`MIBS`).
 
-Error model: the logarithm of the error is linear in figures of picture and scene (`features_of`), with coefficients for each quality,
-by rays and by waves (`ERRORS`).  Both models are fitted to measured designs by `tests/benchmarks/plan.py`, which also judges them by
-pictures left out.
+Error model: the logarithm of the error is linear in figures of picture and scene (`features_of`), with coefficients for each
+quality, by rays and by waves (`ERRORS`).  Both models are fitted to measured designs by `tests/benchmarks/plan.py`, which also
+judges them by pictures left out.
 """
 
 from __future__ import annotations
