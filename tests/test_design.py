@@ -59,7 +59,7 @@ def content(project) -> dict:
         "history": [row[:4] for row in s.history],
         "provenance": held.provenance,
         "knots": torch.cat([space.knots for space in held.spaces]),
-        "results": {k: v for k, v in held.results.items() if k not in ("seconds", "image", "project")},
+        "results": {k: v for k, v in held.results.items() if k not in ("seconds", "accuracy_cost", "image", "project")},
     }
 
 

@@ -1,7 +1,6 @@
 """The plot of rays: vertices obey Snell's law and lie on the surfaces and the screen, and no ray is lost from the count."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -124,6 +123,6 @@ def test_the_command_writes_it_beside_the_image(tmp_path, monkeypatch, capfd):
     said = json.loads(capfd.readouterr().out)["rays_plot"]
     assert said["rays"] == 50 and said["image"] == "a-rays.png" and Path("a-rays.png").stat().st_size > 10_000
     assert cli.run([*asked[:-1], "b.png", "--rays-plot", "2001"]) == 2 and "--rays-plot must be 1 to 2000" in capfd.readouterr().err
-    assert not Path("b.png").exists() and "matplotlib.pyplot" not in sys.modules
+    assert not Path("b.png").exists()
     Path("c-rays.png").write_bytes(b"not of this program")
     assert cli.run([*asked[:-1], "c.png", "--rays-plot", "5"]) == 2 and Path("c-rays.png").read_bytes() == b"not of this program"

@@ -12,14 +12,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.accuracy_cost import Row
 from caustic_cli.inverse.lbfgs import UNFIT, curvature
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
@@ -27,6 +26,9 @@ from caustic_cli.inverse.parametrisation import Heights
 from caustic_cli.inverse.problem import Problem, Skipped
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
+
+if TYPE_CHECKING:
+    from caustic_cli.inverse.accuracy_cost import Row
 
 #: Iterations over which the decrease of the loss is compared with the tolerance of a stage.
 FLAT_SPAN = 10

@@ -7,6 +7,7 @@
 Designs are measured one after the other on an otherwise idle machine; a design that is measured already is left out.
 """
 
+import argparse
 import json
 import subprocess
 import sys
@@ -29,11 +30,16 @@ RIDGE = 0.05
 RESULTS = "designs.jsonl"
 
 
-def main(task: str, directory: str, *pictures: str) -> None:
+def main() -> None:
     """Do one of the tasks above."""
-    place = Path(directory)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("task", choices=("measure", "fit", "judge"))
+    parser.add_argument("directory", type=Path)
+    parser.add_argument("pictures", type=Path, nargs="*")
+    asked = parser.parse_args()
+    task, place = asked.task, asked.directory
     if task == "measure":
-        measure(place, [Path(p).absolute() for p in pictures])
+        measure(place, [p.absolute() for p in asked.pictures])
         return
     rows = [json.loads(line) for line in (place / RESULTS).read_text().splitlines()]
     cases = [case(row) for row in rows]
@@ -146,4 +152,4 @@ def judge(cases: list[dict]) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()
