@@ -45,6 +45,34 @@ def long_rod(pitches: int) -> tuple[float, float]:
     return naive, math.hypot(float(found.point[0][0]) - exact[0], (float(found.momentum[0][0]) - exact[1]) / w)
 
 
+def oblique(tilt: float) -> tuple[float, float]:
+    """Rays that nearly graze a tilted screen 1 km away, in mm on it; naively all in float32."""
+    screen = Screen((40.0, 40.0), 1e6, tilt=(tilt, 10.0))
+    axes, centre = screen.axes, screen.centre
+    start = (2e5, 1e5, 5.0)
+    way = [c + 0.3 * a - 0.2 * b - o for c, a, b, o in zip(centre, axes[0], axes[1], start, strict=True)]
+    direction = [w / math.hypot(*way) for w in way]
+    exact = _on_plane([Decimal(c) for c in start], [Decimal(c) for c in direction], centre, axes)
+
+    def landed(dtype: torch.dtype) -> float:
+        o, d = ([torch.full((1,), c, dtype=dtype) for c in v] for v in (start, direction))
+        x, y, arrives = shape_of(screen).land(backend_for("cpu"), tuple(o), tuple(d), centre, axes, 1.0)
+        return math.hypot(float(x[0]) - exact[0], float(y[0]) - exact[1]) if bool(arrives[0]) else math.inf
+
+    return landed(torch.float32), landed(torch.float64)
+
+
+def _on_plane(start: list[Decimal], direction: list[Decimal], centre, axes) -> tuple[float, float]:
+    """Coordinates on a plane of the ray from a point, with 60 digits."""
+    with localcontext() as context:
+        context.prec = 60
+        e1, e2, e3 = ([Decimal(c) for c in axis] for axis in axes)
+        beside = [Decimal(c) - s for c, s in zip(centre, start, strict=True)]
+        t = sum(a * b for a, b in zip(beside, e3, strict=True)) / sum(a * b for a, b in zip(direction, e3, strict=True))
+        there = [t * d - b for d, b in zip(direction, beside, strict=True)]
+        return tuple(float(sum(a * b for a, b in zip(there, e, strict=True))) for e in (e1, e2))  # type: ignore[return-value]
+
+
 CASES = (
     Case(
         "SELFOC rods of 1 to 10 pitches",
@@ -61,5 +89,13 @@ CASES = (
         1e-12,
         flat_sphere,
         (1e6, 1e9),
+    ),
+    Case(
+        "screens 1 km away at 60 to 85°",
+        "place on the screen, mm",
+        "float32 has no digits left",
+        1e-6,
+        oblique,
+        (60.0, 85.0),
     ),
 )
