@@ -31,17 +31,33 @@ def test_measuring_is_no_part_of_the_time(monkeypatch):
 
     cost = CostOfAccuracy(Start.now(), error_of, 10, 9, [])
     later(1.0, 2.0)
-    cost.measure(0, 0.4)
+    cost.measure(0, 0.4, always=True)
     later(2.0, 3.0)
-    cost.measure(1, 0.3)
-    cost.measure(1, 0.2)  # known
-    cost.measure(2, None)  # no image
+    cost.measure(1, 0.3, always=True)
+    cost.measure(1, 0.2, always=True)  # known
+    cost.measure(2, None, always=True)  # no image
     later(0.5, 0.5)
-    rows = cost.measure(3, 0.1)
+    rows = cost.measure(3, 0.1, always=True)
     assert rows == [Row(0, 1.0, 2.0, 0.4), Row(1, 3.0, 5.0, 0.3), Row(3, 3.5, 5.5, 0.1)]
     resumed = CostOfAccuracy(Start.now(), error_of, 10, 9, rows)
     later(1.0, 1.0)
-    assert resumed.measure(4, 0.05)[-1] == Row(4, 4.5, 6.5, 0.05)
+    assert resumed.measure(4, 0.05, always=True)[-1] == Row(4, 4.5, 6.5, 0.05)
+
+
+def test_long_measurements_are_few(monkeypatch):
+    now = {"wall": 0.0}
+    monkeypatch.setattr(accuracy_cost.time, "monotonic", lambda: now["wall"])
+
+    def error_of(lens):
+        now["wall"] += 2.0
+        return lens
+
+    cost = CostOfAccuracy(Start.now(), error_of, 40, 8, [])
+    for k in range(41):
+        cost.measure(k, 1.0, always=k == 40)
+        now["wall"] += 0.1
+    found = [row.iteration for row in cost.rows]
+    assert found[:2] == [0, 1] and found[-1] == 40 and len(found) <= 4
 
 
 def test_the_price_of_a_smaller_error():

@@ -143,7 +143,7 @@ def _print_plan(asked: DesignOptions, picture: Any) -> None:
     from caustic_cli.workflow.estimate import plans  # noqa: PLC0415
 
     found = list(plans(picture, asked.given, preset=asked.preset, config=asked.config))
-    rows = [("quality", "judged by", "error", "two of three", "seconds", "memory", "project", "no lens below")]
+    rows = [("quality", "judged by", "error", "two of three", "seconds", "memory", "project", "diffraction")]
     for e in found:
         sizes = f"{e.memory_mib / 1024:.1f} GiB", f"{e.project_mib:.0f} MiB"
         between = f"{e.low:.2g} to {e.high:.2g}"

@@ -136,12 +136,13 @@ spectral lines; and an estimate of the error of wave_relative_rms that their num
 .TP
 .B plan
 Of design \-\-plan: rows of quality, error_by, relative_rms to expect, low and high, the range of two designs of three, seconds,
-memory_mib, project_mib, and bound, the error below which diffraction lets no lens come.
+memory_mib, project_mib, and bound, the error that diffraction leaves to any lens.
 .TP
 .B accuracy_cost
 Of a design: rows of iteration, seconds and processor_seconds since its beginning, and error, measured at eight or more iterations
 (all, if they are fewer) by light that the optimiser does not use: of the wave image at seven or more wavelengths other than those
-of its last stage, or by independent rays. The measurements themselves are not part of the times.
+of its last stage, or by independent rays. The measurements themselves are not part of the times; some are left out where they take
+more than 3 s and half of the design's time, as for a dispersive glass.
 .TP
 .B start_error, start_relative_rms, start_noise
 The same quantities for the initial surface of a design, by the same rays; by waves (start_wave_relative_rms), where it is clearly

@@ -16,6 +16,8 @@ import numpy as np
 #: Rows at the end of a design whose slope gives the price of a smaller error; the reduction that is priced; and the exponent of the
 #: error in time below which it no longer decreases.
 LATEST, LESS, FLAT = 4, 0.1, 0.02
+#: Measurements between the first and the last are left out once all took longer than these seconds and this part of the design's.
+ALLOWED, PART = 3.0, 0.5
 
 
 class Start(NamedTuple):
@@ -70,13 +72,16 @@ class CostOfAccuracy:
         self.rows = list(earlier)
         before = self.rows[-1] if self.rows else Row(0, 0.0, 0.0, 0.0)
         self._offset = before.seconds, before.processor_seconds  # less what the measurements took
+        self._spent = 0.0
 
-    def measure(self, iteration: int, lens: Any) -> list[Row]:
-        """Measure the lens after an iteration, unless that was done; all rows."""
-        if not self.rows or self.rows[-1].iteration < iteration:
+    def measure(self, iteration: int, lens: Any, always: bool = False) -> list[Row]:
+        """Measure the lens after an iteration, unless that was done or, without `always`, takes too long; all rows."""
+        late = self._spent > max(ALLOWED, PART * (self._offset[0] + self.start.seconds))
+        if (always or not late) and (not self.rows or self.rows[-1].iteration < iteration):
             wall, processor = (a + b for a, b in zip(self._offset, (self.start.seconds, self.start.processor_seconds), strict=True))
             if (error := self.error_of(lens)) is not None:
                 self.rows.append(Row(iteration, wall, processor, error))
+            self._spent += self._offset[0] + self.start.seconds - wall
             self._offset = wall - self.start.seconds, processor - self.start.processor_seconds
         return self.rows
 
@@ -95,7 +100,7 @@ def price(rows: Sequence[Row]) -> str:
     exponent = -float(np.polyfit(np.log(spent), np.log(errors), 1)[0])
     if exponent < FLAT:
         return f"Further iterations of these stages would not lower the error of {last.error:.3g}."
-    more = (spent[-1]) * math.expm1(-math.log1p(-LESS) / exponent)
+    more = spent[-1] * math.expm1(-math.log1p(-LESS) / exponent)
     return f"The next {LESS:.0%} of the error of {last.error:.3g} would cost about {more:.2g} s more in these stages."
 
 

@@ -415,10 +415,10 @@ class _Watch:
         error_of, count = partial(designer.problem.error_of, designer), designer.problem.effort.cost_points
         self.cost = CostOfAccuracy(began, error_of, self.total, count, state.accuracy)
 
-    def measure(self, now: State) -> None:
-        """Measure the error of the lens, unless that of this iteration is known."""
+    def measure(self, now: State, always: bool = False) -> None:
+        """Measure the error of the lens, as `CostOfAccuracy.measure` does."""
         self.now = now
-        now.accuracy = list(self.cost.measure(now.total, now))
+        now.accuracy = list(self.cost.measure(now.total, now, always))
 
     def reaches(self, goal: float) -> bool:
         """Whether the lens has at most this error, which is measured anew where the loss says that it may."""
@@ -427,7 +427,7 @@ class _Watch:
             return False
         last, losses = now.accuracy[-1], {0: math.inf} | {row[0]: row[2] for row in now.history}
         if last.iteration < now.total and last.error * losses[now.total] <= goal * losses[last.iteration]:
-            self.measure(now)
+            self.measure(now, always=True)
         return now.accuracy[-1].iteration == now.total and now.accuracy[-1].error <= goal
 
     def __call__(self, now: State) -> None:
@@ -498,7 +498,7 @@ def _run(
                     128 + asked[0],
                 )
             watch.keep_if_due(state)
-            watch.measure(state)
+            watch.measure(state, always=True)
             state.heights = rounded(designer.within_limits(state))
         with say.waiting("evaluation with independent rays", evaluation_seconds(designer, state)):
             evaluated = evaluate_and_write(project, designer, state, timed)

@@ -16,6 +16,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,8 +71,6 @@ class Work(NamedTuple):
 
 #: Seconds for a unit of each part on the reference machine.
 SECONDS = Work(6.46, 1.14, 0.0359, 0.0298, 0.02, 0.0224, 0.00545)
-
-
 #: MiB for a unit of each part of `memory_of`.
 MIBS = (765.0, 231.0, 88.3)
 #: Judge and quality -> coefficients of `features_of`, and the standard deviation of the logarithm of the error about them.
@@ -119,8 +118,9 @@ def features_of(problem: OneSurface, size: tuple[float, float]) -> np.ndarray:
 
 
 def cut_off_error(problem: OneSurface) -> float:
-    """A bound below which diffraction lets no lens come: the part of the picture at spatial frequencies above w / (lambda L), the
-    incoherent cut-off of a lens of width w at distance L, over the mean of the picture."""
+    """The error that diffraction leaves to any lens: the part of the picture at spatial frequencies above w / (lambda L), the
+    incoherent cut-off of a lens of width w at distance L, over the mean of the picture.  A bound for a picture that repeats itself
+    beyond the screen; for others but for what their border adds."""
     target = grey(problem.target.numpy())
     scene = problem.scene
     shortest = 1e-6 * min(scene.light.lines()[0])
@@ -244,13 +244,14 @@ def plans(
     slow = slowness()
     judges: set[str] = set()
     for changed in (dict[str, Any](), {"design.waves": "off"}):
+        if changed and "waves" not in judges:
+            break
         for quality in QUALITIES:
             settings = {**given, "quality": quality, **changed}
             project, _ = new_project(target, settings, preset, config, None, lambda _: None)
             found = estimate(project, quality, slow)
-            if not changed or "waves" in judges:
-                yield found
             judges.add(found.error_by)
+            yield found
 
 
 def cheapest(
@@ -265,11 +266,9 @@ def cheapest(
     """The cheapest quality that should reach an error, and those after it; says so where none should.
 
     Raises:
-        InputError: as of `plans`, or the error is below the bound of any lens.
+        InputError: as of `plans`.
     """
-    found = list(plans(target, given, preset=preset, config=config))[: len(QUALITIES)]
-    if error < max(e.bound for e in found):
-        raise InputError(f"⟨error⟩ {error:g} is below {found[0].bound:.3g}, which diffraction lets no lens reach with this picture")
+    found = list(islice(plans(target, given, preset=preset, config=config), len(QUALITIES)))
     good = [k for k, e in enumerate(found) if e.relative_rms <= error]
     first = good[0] if good else len(found) - 1
     e = found[first]
