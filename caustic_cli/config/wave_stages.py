@@ -9,6 +9,7 @@ from caustic_cli.config.exclusions import refuse_excluded, why_excluded
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen, build_source
 from caustic_cli.effort import Effort
 from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.waves.sampling import A_PIXEL, FINER
 from caustic_cli.scene import Scene, Source
 
 
@@ -54,7 +55,19 @@ def wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> flo
     """Estimated number of samples of the field at one wavelength: space-bandwidth product of the lens and the blurred bright
     region."""
     throw, shortest = abs(s.screen.z), min(build_light(s).lines()[0]) * 1e-6
+    return math.prod(w * width / (shortest * throw) for w, width in zip(s.lens.size, _wide(s, seen, lit), strict=True))
+
+
+def transform_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
+    """The same of its transform, which also has A_PIXEL samples per pixel at the longest wavelength."""
+    throw, lines = abs(s.screen.z), build_light(s).lines()[0]
+    shortest, range_of = min(lines) * 1e-6, max(lines) / min(lines)
     return math.prod(
-        w * (part * t + 4.0 * seen.diffraction) / (shortest * throw)
-        for w, t, part in zip(s.lens.size, s.target.size, lit, strict=True)
+        width * max(w / (shortest * throw), A_PIXEL / FINER * range_of * n / across)
+        for w, width, n, across in zip(s.lens.size, _wide(s, seen, lit), s.screen.resolution, s.screen.size, strict=True)
     )
+
+
+def _wide(s: Settings, seen: Resolution, lit: tuple[float, float]) -> list[float]:
+    """Widths of the blurred bright region, mm."""
+    return [part * t + 4.0 * seen.diffraction for t, part in zip(s.target.size, lit, strict=True)]

@@ -26,7 +26,7 @@ from scipy.ndimage import gaussian_filter
 
 from caustic_cli.config.default_stages import transport_cells
 from caustic_cli.config.settings import build_source
-from caustic_cli.config.wave_stages import wave_samples
+from caustic_cli.config.wave_stages import transform_samples
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped, read_bytes, write_bytes
@@ -198,7 +198,7 @@ def estimate(project: Project, quality: str, slow: tuple[float, float]) -> Estim
     s = project.settings
     by = "waves" if any(stage.waves for stage in problem.stages) else "rays"
     seen = Resolution.before(problem.scene, s.target.size)
-    work = work_of(problem, wave_samples(s, seen, project.picture.lit))
+    work = work_of(problem, transform_samples(s, seen, project.picture.lit))
     factors = Work(slow[1], slow[1], slow[1], slow[1], slow[0], slow[0], slow[1])
     seconds = sum(a * b * c for a, b, c in zip(SECONDS, work, factors, strict=True))
     coefficients, spread = ERRORS[by, quality]

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import nnls
 
-from caustic_cli.config.wave_stages import wave_samples
+from caustic_cli.config.wave_stages import transform_samples
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.project.project import Project
 from caustic_cli.workflow import estimate
@@ -80,7 +80,7 @@ def case(row: dict) -> dict:
     project = Project.open(row["dir"])
     problem, s = estimate.problem_of_plan(project), project.settings
     seen = Resolution.before(problem.scene, s.target.size)
-    work = estimate.work_of(problem, wave_samples(s, seen, project.picture.lit))
+    work = estimate.work_of(problem, transform_samples(s, seen, project.picture.lit))
     a, b = row["slow"]
     return row | {
         "work": np.array(work) * [b, b, b, b, a, a, b],
