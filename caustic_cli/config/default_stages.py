@@ -63,8 +63,8 @@ def on_waves(control: Sequence[int], waves: Sequence[float], apron: int, iterati
 
 
 def usual_sampler(source: Source) -> str:
-    """The default sampler: tensor-product rays make a plane wave cheap; other rays are intersected individually."""
-    return "lines" if source.collimated else "stratified"
+    """The default sampler: tensor-product rays make parallel light cheap; other rays are intersected individually."""
+    return "lines" if source.parallel else "stratified"
 
 
 def completed_stage(table: Mapping[str, Any], s: Settings, sampler: str) -> Table:

@@ -17,6 +17,7 @@ the ray to p is found by Newton's method for (a, b), and f = T g |d(a, b) / d(x,
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import singledispatch
 
@@ -26,6 +27,7 @@ from scipy.interpolate import RegularGridInterpolator
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.relay import trace_through, without_apertures, without_freeforms
 from caustic_cli.inverse.transport import cell_means
+from caustic_cli.optics.beam import slopes_inside
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.resampling import resampled
@@ -39,6 +41,8 @@ STEPS = 40
 _STEP, CELLS, LEAST_GROWTH = 1e-5, 128, 1e-3
 #: Subsamples along each axis of a cell cut by a circular aperture.
 PARTS = 8
+#: Points along an edge of the lit part of the exit, and iterations for its place.
+EDGE, PASSES = 65, 3
 #: Largest sine of an extrapolated direction.
 STEEPEST = 0.6
 #: Most Newton iterations for (a, b), and their tolerance in parts of the half width of the lens.
@@ -133,11 +137,56 @@ def _extrapolated(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.nd
 def _from_source(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit directions of the light of the source's centre at points (a, b) of the pupil, mm."""
     if scene.source.distant:
-        return np.zeros_like(a), np.zeros_like(a), np.ones_like(a)
+        dx, dy, dz = (np.full_like(a, c) for c in scene.source.axis)
+        return dx, dy, dz
     x0, y0, z0 = scene.source.centre
     dx, dy, h = a - x0, b - y0, scene.pupil.z - z0
     length = np.sqrt(dx * dx + dy * dy + h * h)
     return dx / length, dy / length, h / length
+
+
+def _tilted(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
+    """`incident` of light from infinity along the source's axis: that of its profile where it crossed the entrance."""
+    lens, profile = scene.lens, scene.source.profile
+    kx, ky = slopes_inside(scene.source.axis, lens.inside)
+    depth = z - lens.z_in
+    crossed = [cell_means(c + 0.0 * depth) for c in (x[:, None] - kx * depth, y[None, :] - ky * depth)]
+    light = np.ones(crossed[0].shape)
+    for inside, step in zip(lens.opening.edges(*crossed, lens.half_size), (x[1] - x[0], y[1] - y[0]), strict=True):
+        light *= 1.0 if inside is None else np.clip(inside / step + 0.5, 0.0, 1.0)  # the lit part of a cell at the edge
+    if profile is not None:
+        at = ((0.5 * (c / r + 1.0) * n).astype(int) for c, r, n in zip(crossed, lens.half_size, profile.shape, strict=True))
+        light *= profile[tuple(np.clip(i, 0, n - 1) for i, n in zip(at, profile.shape, strict=True))]
+    over = 1.0 / math.sqrt(1.0 + kx * kx + ky * ky)
+    return light, tuple(np.full_like(z, c * over) for c in (kx, ky, 1.0))
+
+
+def lit_rectangle(
+    scene: Scene, surface: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Lower and upper limits, x and y, mm, of the rectangle of the exit that light reaches: all of it, less what is in the shadow
+    of the lens' sides where light is tilted to the axis.
+
+    surface: heights (n, m) of the exit, mm, at x (n,), y (m,).
+
+    Raises:
+        InputError: no light reaches the exit.
+    """
+    lens, source = scene.lens, scene.source
+    low, high = [-r for r in lens.half_size], list(lens.half_size)
+    if not (source.distant and source.lean):
+        return (low[0], low[1]), (high[0], high[1])
+    lines = [np.linspace(-r, r, EDGE) for r in lens.half_size]
+    for axis, slope in enumerate(slopes_inside(source.axis, lens.inside)):
+        limit = low if slope > 0 else high
+        for _ in range(PASSES if slope else 0):  # the light that passes this edge of the entrance meets the exit at its own height
+            places = list(lines)
+            places[axis] = np.array([limit[axis]])
+            depth = float(surface(*places).min()) - lens.z_in
+            limit[axis] = math.copysign(lens.half_size[axis], -slope) + slope * depth
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise InputError("⟨source.tilt⟩: all light leaves the lens through its sides; a thinner lens or less tilt keeps some")
+    return (low[0], low[1]), (high[0], high[1])
 
 
 def _pupil_irradiance(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -169,6 +218,8 @@ def _(aperture: CircularAperture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
     """`incident` over the whole rectangle, by the closed form above."""
     source, lens, shape = scene.source, scene.lens, (len(x) - 1, len(y) - 1)
+    if source.lean and source.distant:
+        return _tilted(scene, x, y, z)
     if source.distant:
         profile = source.profile
         return (np.ones(shape) if profile is None else resampled(profile, shape)), None

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -19,8 +21,8 @@ from torch import Tensor
 
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.incidence import incident
-from caustic_cli.inverse.projection import ScreenProjection
+from caustic_cli.inverse.incidence import incident, lit_rectangle
+from caustic_cli.inverse.projection import BeamProjection, ScreenProjection
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
@@ -33,6 +35,8 @@ from caustic_cli.scene.elements import SIDES
 #: Most cells for which transport is solved.  Where more are needed, as for creases, it is solved on about COARSE, and the map is
 #: evaluated on finer cells.
 SOLVED, COARSE = 1024, 512
+#: Cells along the lens on which the shadow of its sides is found in tilted light.
+ROUGH = 128
 #: Sites per bright pixel where the map is evaluated on finer cells; fraction of the cells then needed that is accepted if it
 #: divides the finer ones.
 SITES, NEARLY = 2, 0.95
@@ -58,6 +62,10 @@ UNREACHED = (
 )
 
 
+#: Heights (n, m), mm, at x (n,), y (m,), mm.
+Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
 @dataclass(frozen=True, eq=False)
 class InitialSurface:
     """An initial surface: control heights (n, m) mm float64, and its vertex height, mm, where that was chosen (near sources)."""
@@ -68,22 +76,45 @@ class InitialSurface:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Grid of source cells over the lens of a scene, with corners x (n + 1,), y (m + 1,) mm, and the target."""
+    """Grid of source cells over the lens of a scene, or over its part that is lit, with corners x (n + 1,), y (m + 1,) mm from the
+    middle of that part, which lies at `middle` on the lens, mm; and the target."""
 
-    scene: Scene
+    whole: Scene
     target: np.ndarray
     x: np.ndarray
     y: np.ndarray
+    middle: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, scene: Scene, target: np.ndarray, cells: int) -> _Grid:
-        return cls(scene, target, *cell_lines(scene.lens.half_size, cells))
+    def of(cls, scene: Scene, target: np.ndarray, cells: int, surface: Surface | None = None) -> _Grid:
+        """Cells where light reaches a surface, the offset unless it is given."""
+        low, high = lit_rectangle(scene, surface or scene.lens.offset.heights)
+        half, middle = ([0.5 * (b + s * a) for a, b in zip(low, high, strict=True)] for s in (-1.0, 1.0))
+        return cls(scene, target, *cell_lines((half[0], half[1]), cells), (middle[0], middle[1]))
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene in the frame of the grid, with a lens of its size."""
+        (mx, my), whole = self.middle, self.whole
+        if not (mx or my):
+            return whole
+        lens = replace(whole.lens, size=(2.0 * float(self.x[-1]), 2.0 * float(self.y[-1])))
+        (sx, sy) = whole.screen.shift
+        return replace(whole, lens=lens, screen=replace(whole.screen, shift=(sx - mx, sy - my)))
+
+    @property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """x and y of the corners on the lens, mm."""
+        return self.x + self.middle[0], self.y + self.middle[1]
 
     @property
     def offset(self) -> np.ndarray:
         """Heights of the offset surface at the corners, mm."""
-        offset = self.scene.lens.offset
-        return offset.heights(self.x, self.y)
+        return self.whole.lens.offset.heights(*self.places)
+
+    def incident(self, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
+        """`incidence.incident` for heights z at the corners, mm."""
+        return incident(self.whole, *self.places, z)
 
     @property
     def floor(self) -> float:
@@ -97,7 +128,7 @@ class _Grid:
     def solved(self, light: np.ndarray, directions, mean: float, potential: np.ndarray | None = None, **options) -> MappedSurface:
         """The surface of this mean height that maps the light to the picture; potential: initial one at these corners, mm^2."""
         scene = self.scene
-        if not light.all() and (scene.in_front or not scene.source.distant):
+        if not light.all() and (scene.in_front or not scene.source.collimated):
             options["darkest"] = DARKEST
         projection = self.projection(mean)
         target, half, centre = (
@@ -123,8 +154,9 @@ class _Grid:
     def sharper(self, found: MappedSurface, times: int) -> tuple[_Grid, np.ndarray]:
         """A grid of cells `times` finer, and the heights there of a surface solved on this grid, with sharper creases."""
         scene, mean = self.scene, float(found.heights.mean())
-        fine = _Grid(scene, self.target, *(corners(times * (len(c) - 1), c[-1]) for c in (self.x, self.y)))
-        _, directions = incident(scene, fine.x, fine.y, self.scaled(found.heights, fine))
+        x, y = (corners(times * (len(c) - 1), c[-1]) for c in (self.x, self.y))
+        fine = _Grid(self.whole, self.target, x, y, self.middle)
+        _, directions = fine.incident(self.scaled(found.heights, fine))
         projection = self.projection(mean)
         centre = scene.screen.shift if projection is None else projection.projected_target(self.target)[2]
         index = scene.lens.effective_index
@@ -136,7 +168,10 @@ class _Grid:
         screen = self.scene.screen
         if self.scene.behind:
             return RelayedScreen(self.scene, mean)
-        return None if screen.upright else ScreenProjection(screen, mean, self.scene.lens.interaction.side)
+        source, side = self.scene.source, self.scene.lens.interaction.side
+        if source.distant and source.lean:
+            return BeamProjection(screen, mean, side, source.axis)
+        return None if screen.upright else ScreenProjection(screen, mean, side)
 
     def above(self, z: np.ndarray) -> np.ndarray:
         """Fraction of the corners of each cell where the surface is not truncated."""
@@ -235,15 +270,20 @@ def first_surface(
         options = {"tolerance": EXACT, "most": STEPS}
     grid, lens = _Grid.of(scene, target, cells // times), scene.lens
     z = grid.offset
+    if scene.source.distant and scene.source.lean:  # the shadow of the lens' sides depends on the heights
+        rough = _Grid.of(scene, target, ROUGH)
+        surface = extended(*rough.places, rough.solved(*rough.incident(rough.offset), float(rough.offset.mean())).heights)
+        grid = _Grid.of(scene, target, cells // times, surface)
+        z = surface(*grid.places)
     if scene.source.distant or lens.mirror or scene.elements:
         found = None
         for _ in range(1 if scene.source.distant and not scene.in_front else PASSES):
             known = None if found is None else found.transport.potential
-            found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), known, **options)
+            found = grid.solved(*grid.incident(z), float(z.mean()), known, **options)
             z = found.heights
         if times > 1:
             grid, z = grid.sharper(found, times)
-        return InitialSurface(net_of(grid.x, grid.y, z, field))
+        return InitialSurface(net_of(*grid.places, z, field))
     coarse = _Grid.of(scene, target, min(cells, few))
     found = _best(coarse, lens.offset.thickness, fixed)
     within = cells
@@ -299,10 +339,24 @@ def _best(grid: _Grid, middle: float, fixed: bool) -> _TruncatedSurface:
     return max(tried, key=lambda t: t[0])[1]
 
 
-def net_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, field: HeightField) -> Tensor:
-    """Control heights (n, m) of the surface with these heights at corners x (k,), y (l,): z (k, l), mm."""
+def extended(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Surface:
+    """The cubic spline through heights z (k, l) at x (k,), y (l,), mm; linear beyond its edges."""
     spline = RectBivariateSpline(x, y, z)
-    values = torch.from_numpy(spline(*(c.numpy() for c in field.control_xy())))
+
+    def heights(*places: np.ndarray) -> np.ndarray:
+        within = [np.clip(at, c[0], c[-1]) for at, c in zip(places, (x, y), strict=True)]
+        beside = [at - inner for at, inner in zip(places, within, strict=True)]
+        found = spline(*within)
+        if any(b.any() for b in beside):
+            found = found + spline(*within, dx=1) * beside[0][:, None] + spline(*within, dy=1) * beside[1]
+        return found
+
+    return heights
+
+
+def net_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, field: HeightField) -> Tensor:
+    """Control heights (n, m) of the surface with these heights at corners x (k,), y (l,): z (k, l), mm; linear beyond them."""
+    values = torch.from_numpy(extended(x, y, z)(*(c.numpy() for c in field.control_xy())))
     net = field.interpolated(values)
     # An interpolating spline of high degree with repeated knots overshoots; the values as control net (Schoenberg) do not.
     return net if float(net.max() - net.min()) <= OVERSHOOT * float(values.max() - values.min()) else values

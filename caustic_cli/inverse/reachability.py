@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.distribution import relative
@@ -105,7 +106,8 @@ def _in_glass(scene: Scene, rays: int) -> Iterator[tuple[np.ndarray, np.ndarray,
         sine = math.sin(source.half_angle)
         a, b = (sine * c[:, None] for c in AROUND)
         along = np.sqrt(1.0 - a * a - b * b)
-        yield _refracted(scene, x, y, a / along + 0.0 * x, b / along + 0.0 * y)
+        p, q, up = turned_about(source.axis, a / along, b / along)
+        yield _refracted(scene, x, y, p / up + 0.0 * x, q / up + 0.0 * y)
         return
     cone = min(source.cone_over(lens.pupil), 0.5 * math.pi)
     around = AROUND if max(source.extent) > 0 else AROUND[:, :1]

@@ -73,6 +73,10 @@ class RelayedScreen:
         """L, mm."""
         return self.scene.screen.z - self.centre_z
 
+    def gain(self, index: float) -> float:
+        """As of a `ScreenProjection`."""
+        return (index - 1.0) * self.distance
+
     def landing(self, origin: tuple, direction: tuple) -> tuple[np.ndarray, np.ndarray]:
         """X of rays, NaN where they do not reach the screen."""
         shape = np.broadcast_shapes(*map(np.shape, (*origin, *direction)))

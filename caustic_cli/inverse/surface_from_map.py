@@ -223,7 +223,7 @@ def heights(
         OutOfReach: light of a lit corner cannot be refracted to its target point.
     """
     step = float(x[1, 0] - x[0, 0]), float(y[0, 1] - y[0, 0])
-    scale = 1.0 / ((index - 1.0) * (z_screen - mean))
+    scale = 1.0 / ((index - 1.0) * (z_screen - mean) if projection is None else projection.gain(index))
     if projection is None:
         main = scale * (map_.potential - 0.5 * (x * x + y * y))
         slope = scale * (map_.x - x), scale * (map_.y - y)

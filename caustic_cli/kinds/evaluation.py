@@ -122,7 +122,7 @@ class LensEvaluation:
             return
         heights = problem.feasible(state.stage, self.designer.initial_surface(state))
         # other light has an estimate of the noise anyway
-        noise, figures = not problem.scene.source.collimated or state.unrounded is not None, self.figures
+        noise, figures = not problem.scene.source.parallel or state.unrounded is not None, self.figures
         _, light, initial = self.see(heights, noise, self.few)
         if self.few and not (initial["wave_relative_rms"] or 0.0) > CLEARLY * figures["wave_relative_rms"]:
             _, light, initial = self.see(heights, noise)

@@ -23,7 +23,7 @@ from caustic_cli.config.default_stages import (
     transport_cells,
 )
 from caustic_cli.config.design import build_options, build_stages, relative_to_initial
-from caustic_cli.config.settings import Settings, build_screen
+from caustic_cli.config.settings import Settings
 from caustic_cli.config.wave_stages import wave_stages
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import CausticError, InputError
@@ -243,7 +243,7 @@ class OneSurface(Problem):
         Diffraction smooths creases more than a coarser net, and the pixels of a tilted screen do not coincide with those that the
         map is solved for, which shows as lines: a flame at 30 degrees has an error of 0.205 on the finer net and 0.087 without.
         """
-        aligned = d.source.distant and build_screen(d.s.screen).upright
+        aligned = d.source.distant
         creased = d.gaps >= GAPS and not (d.own_control or waves or cls.spread(d)) and aligned
         if creased:
             d.set_control([creased_control(max(d.resolution), p, d.effort.creased) for p in d.lens.degree])
@@ -392,7 +392,7 @@ class OneSurface(Problem):
         """
         scene, goal, first = self.scene, grey(self.target.numpy()), self.stages[0]
         spans = min(n - p for n, p in zip(first.control, scene.lens.degree, strict=True))
-        cells = transport_cells(max(s.rays for s in self.stages), not scene.source.collimated, spans, self.effort.source_cells)
+        cells = transport_cells(max(s.rays for s in self.stages), not scene.source.parallel, spans, self.effort.source_cells)
         spread = source_spread(scene) if first.spread else None
         if spread is not None:
             light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)

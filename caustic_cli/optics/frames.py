@@ -99,6 +99,14 @@ def rotate_to_global(pose: Pose, vector) -> tuple:
     return tuple(sum(c * axis[k] for c, axis in zip(vector, pose.axes, strict=True)) for k in range(3))
 
 
+def turned_about(axis: tuple[float, float, float], x, y) -> tuple:
+    """Components, up to a positive factor, of vectors with slopes x and y to an axis, by the rotation that takes +z to it without
+    twist."""
+    a, b, c = axis
+    along = a * x + b * y
+    return x + a * (1.0 - along / (1.0 + c)), y + b * (1.0 - along / (1.0 + c)), c - along
+
+
 def advance(origin, direction, t: Tensor) -> tuple:
     """o + t d, where products with plain 0 and 1 are omitted."""
     return tuple(

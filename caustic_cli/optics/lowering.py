@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TypeGuard
 
 from caustic_cli.optics.backends import Fused
+from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.rays import RayState
@@ -20,7 +21,7 @@ from caustic_cli.scene import Pupil, Screen
 def lowered(tracer, previous: Fused | None) -> Fused | None:
     """The rest of a tracer's system as one fused kernel; None where it does not apply.  previous: that of the previous chunk, whose
     prepared arrays are reused."""
-    if isinstance(tracer.rays, Pencil) and (fused := _pencil(tracer, tracer.rays, previous)) is not None:
+    if isinstance(tracer.rays, Pencil | Beam) and (fused := _pencil(tracer, tracer.rays, previous)) is not None:
         return fused
     system, start, (inside, outside) = tracer.system, tracer.start, tracer.media[-2:]
     element = system.elements[-1]
@@ -38,8 +39,9 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
     return tracer.backend.plane_image(element.surface, start, eta, element.fresnel, previous)
 
 
-def _pencil(tracer, pencil: Pencil, previous: Fused | None) -> Fused | None:
-    """All of a tracer's system as one kernel for the rays of a source point: a flat entrance in front of the last surface."""
+def _pencil(tracer, pencil: Pencil | Beam, previous: Fused | None) -> Fused | None:
+    """All of a tracer's system as one kernel for the rays of a source point, or of one at infinity: a flat entrance in front of the
+    last surface."""
     system = tracer.system
     if _needs_stages(tracer) or len(system.elements) != 2 or not system.lit:
         return None
@@ -50,9 +52,8 @@ def _pencil(tracer, pencil: Pencil, previous: Fused | None) -> Fused | None:
     before, inside, outside = (medium.index_at(tracer.wavelength) for medium in tracer.media)
     if inside <= before or (exit.fresnel == "schlick" and inside < outside):
         return None
-    return tracer.backend.pencil_image(
-        exit.surface, pencil, (inside / before, entrance.fresnel), inside / outside, exit.fresnel, previous
-    )
+    image = tracer.backend.beam_image if isinstance(pencil, Beam) else tracer.backend.pencil_image
+    return image(exit.surface, pencil, (inside / before, entrance.fresnel), inside / outside, exit.fresnel, previous)
 
 
 def _needs_stages(tracer) -> bool:
@@ -76,6 +77,8 @@ def _are_plain(rays: RayState) -> bool:
     return rays.polarised is None and isinstance(rays.origin[2], float)
 
 
-def covers(screen: Screen | PlacedScreen) -> TypeGuard[Screen]:
-    """Whether the fused kernels splat onto such a screen."""
-    return isinstance(screen, Screen) and screen.upright
+def covers(screen: Screen | PlacedScreen, fused: Fused | None) -> TypeGuard[Screen]:
+    """Whether a fused kernel splats onto such a screen."""
+    if not isinstance(screen, Screen) or fused is None:
+        return False
+    return screen.upright or (getattr(fused, "tilts", False) and not screen.curved and not screen.windows)

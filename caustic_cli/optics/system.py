@@ -245,9 +245,10 @@ class System:
     def _along(self) -> tuple[list[float], tuple[float, float, float]]:
         """Cosines between the axis and each element's z axis, and the direction of the axis behind the last element.
 
-        The axis starts along +z, is undeviated by refraction, and is reflected by mirrors like a ray at the vertex.
+        The axis starts along +z, or in the direction of a source at infinity, is undeviated by refraction, and is reflected by
+        mirrors like a ray at the vertex.
         """
-        axis, cosines = (0.0, 0.0, 1.0), []
+        axis, cosines = self.source.axis if self.source.distant else (0.0, 0.0, 1.0), []
         for element in self.elements:
             normal = element.pose.axes[2]
             cosine = sum(a * b for a, b in zip(axis, normal, strict=True))

@@ -31,6 +31,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import Fused, backend_for, in_forward_mode, usable
+from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Emission, Rays, of_member, rays_of
 from caustic_cli.optics.frames import rotate_to_global, rotate_to_local
@@ -90,7 +91,7 @@ class Tracer:
     def __init__(
         self,
         system: System,
-        rays: Sample | RayState | Pencil,
+        rays: Sample | RayState | Pencil | Beam,
         dtype: torch.dtype = torch.float64,
         requests: Requests = NO_REQUESTS,
         like: Tracer | None = None,
@@ -147,7 +148,7 @@ class Tracer:
     def emitted(self) -> RayState:
         """The rays in front of the first element."""
         rays, pupil = self.rays, self.system.pupil
-        state = rays.at_pupil() if isinstance(rays, Pencil) else rays
+        state = rays.at_pupil() if isinstance(rays, Pencil | Beam) else rays
         return state if isinstance(state, RayState) else RayState.on_axis(state, pupil.half_size, pupil.z)
 
     @property
@@ -246,7 +247,7 @@ class Tracer:
 
     def expose(self, parameters: Parameters, screen: Screen | PlacedScreen, filter: Filter) -> Image[Tensor]:
         """Heights {name: (n, m) mm float64} -> image and energy balance on a screen."""
-        if self.fused is not None and covers(screen) and not in_forward_mode():
+        if self.fused is not None and covers(screen, self.fused) and not in_forward_mode():
             image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
             if self.lit is None:
                 for name, value in self.start.lost.items():
@@ -361,14 +362,16 @@ class Tracer:
 
 def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUESTS) -> bool:
     """Whether a scene is traced by a fused kernel."""
-    few = next(iter(rays_of(scene, "grid", 4).chunks()))
-    return covers(scene.screen) and Tracer(System.of(scene, field), few, requests=requests).fused is not None
+    few = next(tracers(scene, field, rays_of(scene, "grid", 4), torch.float64, FEW, requests))
+    return covers(scene.screen, few.fused)
 
 
 def is_by_rows(scene: Scene, field: HeightField, rays: Rays) -> bool:
     """Whether rays are traced by a fused kernel that evaluates the surface at a tensor product of its points."""
     first = next(tracers(scene, field, rays, torch.float64, FEW), None)
-    return first is not None and first.fused is not None and (first.lit is not None or first.start.along_axis)
+    if first is None or first.fused is None:
+        return False
+    return first.rays.sample.tensor if isinstance(first.rays, Pencil | Beam) and first.lit is not None else first.start.along_axis
 
 
 def evaluates_by_rows(scene: Scene) -> bool:
@@ -407,7 +410,7 @@ def tracers(
             yield traced
 
 
-def _chunks(sampler: Rays, size: int, share: tuple[int, int]) -> Iterator[Sample | RayState | Pencil]:
+def _chunks(sampler: Rays, size: int, share: tuple[int, int]) -> Iterator[Sample | RayState | Pencil | Beam]:
     """The rays of a sampler, as pencils where they are."""
     if isinstance(sampler, Emission) and sampler.homocentric:
         return sampler.pencils(size, *share)

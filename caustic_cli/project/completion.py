@@ -69,7 +69,7 @@ def complete(
         s = s.changed(source=at, design=complete_network(s.design))
     if over or relative_to_initial(s.design):
         s = s.changed(design=s.design if "initial" in given.get("design", {}) else s.design.changed(initial="zero-last"))
-    s = s.changed(second=complete_second(s))
+    s = s.changed(screen=facing(s), second=complete_second(s))
     s = s.changed(target=complete_target(s, by, aspect))
     s = s.changed(screen=complete_screen(s.screen, s.target, by))
     s = s.changed(second=complete_second_size(s))
@@ -135,6 +135,16 @@ def complete_source(
     for type in types:
         source = source.filled(**type.defaults(lens))
     return source.without(*{*SourceSettings.of({})}.difference(sources.COMMON, *(type.keys for type in types)))
+
+
+def facing(s: Settings) -> ScreenSettings:
+    """The screen, square to light that is tilted and centred on it, where its own tilt and shift are not given."""
+    tilt = s.source.tilt
+    if tilt is None or not any(tilt):
+        return s.screen
+    side, (dx, dy, dz) = interaction_of(s.lens.mirror).side, build_source(s.source).axis
+    reach = abs(s.screen.z) / dz
+    return s.screen.filled(tilt=[side * angle for angle in tilt], shift=[reach * dx, reach * dy])
 
 
 def complete_target(s: Settings, by: Parameters, aspect: float) -> TargetSettings:

@@ -74,7 +74,7 @@ class PictureError:
     @cached_property
     def largest(self) -> float:
         """Largest error of a surface that keeps the picture."""
-        noise = min(self._own[1]["error_estimate"] or 0.0, self.own) if self.plan.scene.source.collimated else 0.0
+        noise = min(self._own[1]["error_estimate"] or 0.0, self.own) if self.plan.scene.source.parallel else 0.0
         return float(np.sqrt(noise**2 + MARGIN**2 * (self.own**2 - noise**2)))
 
     def through(self, surface: HeightField | MeasuredSurface, heights: Tensor | None, entrance: FreeForm | None = None) -> float:
@@ -90,7 +90,7 @@ class PictureError:
         return self._retrace(scene, surface, heights)[1]["relative_rms"]
 
     def _retrace(self, scene: Scene, surface, heights: Tensor | None, noise: bool = False) -> tuple[np.ndarray, dict]:
-        each = EACH if scene.source.collimated else EACH_OTHER
+        each = EACH if scene.source.parallel else EACH_OTHER
         image, figures = retrace(
             scene,
             surface,

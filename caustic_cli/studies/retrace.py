@@ -49,7 +49,7 @@ def sampler_for(scene: Scene, rays: int, seed: int, device: str = "cpu") -> Rays
 
 def _rays(scene: Scene, rays: int, seed: int, device: str) -> Rays:
     """Stratified rays of a plane wave (two dimensions); a Sobol sequence for other sources (up to four dimensions)."""
-    even = scene.source.collimated or rays > SOBOL_RAYS // 2
+    even = scene.source.parallel or rays > SOBOL_RAYS // 2
     return rays_of(scene, "stratified" if even else "sobol", rays, seed, device)
 
 
@@ -92,7 +92,7 @@ def converge(
     Raises:
         CausticError: MOST_RAYS or those of a file are not enough, or no light reaches the screen.
     """
-    each, traced, order = max(1, rays // BATCHES), 0, ORDER if scene.source.collimated else SOBOL_ORDER
+    each, traced, order = max(1, rays // BATCHES), 0, ORDER if scene.source.parallel else SOBOL_ORDER
     available, lights = _available(scene), [scene.batch(k, BATCHES) for k in range(BATCHES)]
     while True:
         if each * BATCHES > available:
@@ -188,7 +188,7 @@ def retrace(
         sampler = _rays(light, max(1, count), stream(seed, name), device)
         return limited_to_source(expose(light, field, heights, sampler, None, dtype, requests=requests))
 
-    even = scene.source.collimated
+    even = scene.source.parallel
     if tolerance is not None:
         found = converge(scene, field, heights, tolerance, rays=rays, seed=seed, device=device, dtype=dtype, requests=requests)
         counted = found.exposure
@@ -233,7 +233,7 @@ def evaluation_rays(scene: Scene, usual: int = STANDARD.final_rays) -> int:
 
     usual: for 250 x 250 pixels.
     """
-    times = math.prod(scene.screen.resolution) / FINAL_PIXELS if scene.source.collimated else 1.0
+    times = math.prod(scene.screen.resolution) / FINAL_PIXELS if scene.source.parallel else 1.0
     return round(usual * min(max(1.0, times), MOST_FINAL))
 
 

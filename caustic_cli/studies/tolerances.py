@@ -180,7 +180,7 @@ class Trials:
         return self.surfaces.heights(np.random.default_rng([self.tolerances.seed, 1, number]), which)
 
     def _rays(self, errors: Misalignment, heights: Tensor, half: int) -> list[LandingPoints]:
-        changed, even = errors.scene(self.scene), self.scene.source.collimated or self.rays > SOBOL_RAYS // 4
+        changed, even = errors.scene(self.scene), self.scene.source.parallel or self.rays > SOBOL_RAYS // 4
         kind, seed = "stratified" if even else "sobol", stream(self.tolerances.seed, f"tolerances {half}")
         rays = rays_of(changed.batch(half % 2, 2), kind, self.rays, seed)
         return list(landing_points(self.scene, self.field, heights, rays, errors, self.requests))

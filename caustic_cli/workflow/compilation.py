@@ -124,12 +124,12 @@ def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = Fal
     Net and image are small, and a plane wave or a point represents the source.  gradient: compile the adjoints, too.
     """
     lens = replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None, array=(1, 1))
-    source = PlaneWave() if scene.source.collimated else Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
+    source = scene.source if scene.source.parallel else Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
     scene, field = Scene(source, lens, scene.screen, Light(scene.light.polarisation)), HeightField.of(lens)
     heights = torch.full((4, 4), lens.offset.thickness, dtype=torch.float64, requires_grad=gradient)
     screen = replace(scene.screen, resolution=(4, 4))
     with torch.set_grad_enabled(gradient):
-        for kind in ("lines", "stratified") if scene.source.collimated else ("stratified",):
+        for kind in ("lines", "stratified") if scene.source.parallel else ("stratified",):
             traced = next(tracers(scene, field, rays_of(scene, kind, 16), torch.float64, 1 << 10, requests))
             image = traced.expose({EXIT: heights}, screen, Filter("cosine", (3, 3)))
             if gradient:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from caustic_cli.optics import intersection
 from caustic_cli.optics.backends.reference import Torch
+from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.gradient.fields import LEAST_SQUARE, SplineIndex
 from caustic_cli.optics.gradient.integrator import WEIGHTS, Flow
 from caustic_cli.optics.interface import OutgoingRays
@@ -28,6 +29,7 @@ from caustic_cli.optics.kernels.surface import FusedSurface, next_intersections,
 from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import HALVINGS, MOST_STEPS
 from caustic_cli.optics.sampling import Sample, key, salt
@@ -177,6 +179,12 @@ class Numba(Torch):
         emission = pencil.polynomial(*entrance)
         return None if emission is None else PencilImage(field, pencil, entrance, emission, (eta, fresnel), like)
 
+    def beam_image(
+        self, field, beam: Beam, entrance: tuple[float, str], eta: float, fresnel: str, like: BeamImage | None
+    ) -> BeamImage:
+        """The same for parallel rays at an angle to z."""
+        return BeamImage(field, beam, entrance, (eta, fresnel), like)
+
     def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
         """The fused kernel for arbitrary rays below a B-spline."""
         return RayImage(field, rays, eta, fresnel, radius, like)
@@ -242,6 +250,30 @@ class PencilImage:
             "missed_surface": self.passed - met,
             "fresnel": self.entering - self.passed + lost["fresnel"],
         }
+        return image, leaving, lost
+
+
+class BeamImage:
+    """See `Numba.beam_image`; like: as for `PlaneImage`."""
+
+    #: It has plane screens of any orientation.
+    tilts = True
+
+    def __init__(self, field, beam: Beam, entrance: tuple[float, str], interface: tuple[float, str], like: BeamImage | None):
+        self.interface = interface
+        #: Power through the pupil, and less what the entrance reflects, ().
+        self.entering = torch.tensor(beam.emitted, dtype=torch.float64)
+        self.passed = self.entering * beam.transmittance(*entrance)
+        before = like.kernel if isinstance(like, BeamImage) else None
+        self.kernel: fused_functions.BeamKernel = fused_functions.BeamKernel(field.spaces, field.half_size, beam, entrance, before)
+
+    def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
+        """Image, power that leaves the surface, and what was lost since the source; what misses the surface is the rest."""
+        reference = float(heights.detach().mean())
+        receiver = Receiver.on_axis(screen, (0.0, 0.0, 1.0))
+        image, leaving, lost = self.kernel.onto(heights - reference, *self.interface, reference, receiver, filter)
+        met = leaving.detach() + lost["fresnel"] + lost["total_internal_reflection"]
+        lost |= {"missed_surface": self.passed - met, "fresnel": self.entering - self.passed + lost["fresnel"]}
         return image, leaving, lost
 
 

@@ -136,6 +136,10 @@ class Torch:
         """No fused kernel for rays of a source point."""
         return None
 
+    def beam_image(self, *_: Any, **__: Any) -> Fused | None:
+        """None: no fused kernel."""
+        return None
+
     def ray_image(self, *_: Any, **__: Any) -> Fused | None:
         """No fused kernel for other rays."""
         return None

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import SAMPLERS, TENSOR, numbers
@@ -88,8 +89,8 @@ class Emission:
         """Whether its rays can be had as `pencils`."""
         return False
 
-    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Pencil]:
-        """The rays in `chunks` of whole rows, as pencils."""
+    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Pencil | Beam]:
+        """The rays in `chunks` of whole rows, as pencils, or as beams where their vertex is at infinity."""
         raise NotImplementedError
 
     def _drawn(self, start: int, *draws: Tensor) -> RayState:

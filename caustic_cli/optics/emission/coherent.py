@@ -17,6 +17,7 @@ from torch import Tensor
 from caustic_cli.optics.emission.base import Illuminated, intensity_of
 from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.emission.parallel import mean_irradiance
+from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Source
@@ -85,7 +86,7 @@ class Mode:
 def central_mode(scene: Illuminated) -> Mode:
     """A point at the source's centre with all its power."""
     source = scene.source
-    return Mode(scene, (0.0, 0.0, 1.0) if source.distant else source.centre, 1.0)
+    return Mode(scene, source.axis if source.distant else source.centre, 1.0)
 
 
 def outermost_modes(scene: Illuminated) -> list[Mode]:
@@ -94,7 +95,7 @@ def outermost_modes(scene: Illuminated) -> list[Mode]:
     if source.distant:
         s = math.sin(source.half_angle)
         ways = ((1, 0), (-1, 0), (0, 1), (0, -1)) if s else ()
-        return [Mode(scene, (a * s, b * s, math.sqrt(1.0 - s * s)), 1.0) for a, b in ways]
+        return [Mode(scene, _direction(source, a * s, b * s), 1.0) for a, b in ways]
     if not source.extended:
         return []
     at, (ex, ey) = source.points()[0], source.extent
@@ -113,16 +114,20 @@ def modes(scene: Illuminated, each: int) -> list[Mode]:
     source = scene.source
     if source.distant:
         spread = _spots(source, each)
-        found = []
-        for dx, dy in spread:
-            found.append(Mode(scene, (dx, dy, math.sqrt(1.0 - dx * dx - dy * dy)), 1.0 / len(spread)))
-        return found
+        return [Mode(scene, _direction(source, dx, dy), 1.0 / len(spread)) for dx, dy in spread]
     (positions, parts), spread = source.points(), _spots(source, each)
     return [
         Mode(scene, (float(x + dx), float(y + dy), float(z)), float(part) / len(spread))
         for (x, y, z), part in zip(positions, parts, strict=True)
         for dx, dy in spread
     ]
+
+
+def _direction(source: Source, across: float, along: float) -> tuple[float, float, float]:
+    """Unit direction with these components across the axis of a distant source."""
+    c = math.sqrt(1.0 - across * across - along * along)
+    x, y, z = turned_about(source.axis, across / c, along / c)
+    return c * x, c * y, c * z
 
 
 def _spots(source: Source, each: int) -> list[tuple[float, float]]:

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from caustic_cli.optics.emission.base import Emission, intensity_of
 from caustic_cli.optics.emission.brightness import points_by_brightness
+from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.pencil import Pencil
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sampler, numbers
@@ -162,12 +163,9 @@ class NearDisc(Near):
 
 
 def _slopes_about(axis: tuple[float, float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Slopes dx/dz and dy/dz of rays whose slopes to an axis are x and y, by the rotation that takes +z to it without twist;
-    infinite for those that do not ascend."""
-    a, b, c = axis
-    along = a * x + b * y
-    dz = c - along
-    turned = (x + a * (1.0 - along / (1.0 + c)), y + b * (1.0 - along / (1.0 + c)))
+    """Slopes dx/dz and dy/dz of rays whose slopes to an axis are x and y, see `turned_about`; infinite for those that do not
+    ascend."""
+    *turned, dz = turned_about(axis, x, y)
     across, up = (torch.where(dz > 0, t / dz, math.inf) for t in turned)
     return across, up
 

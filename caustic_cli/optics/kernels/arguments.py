@@ -39,9 +39,9 @@ class ScreenFrame(NamedTuple):
     pixel_y: float
 
     @classmethod
-    def of(cls, screen: Screen) -> ScreenFrame:
-        """Of a screen."""
-        return cls(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
+    def of(cls, screen: Screen, low: tuple[float, float] | None = None) -> ScreenFrame:
+        """Of a screen; low: its lower edges, mm, where coordinates are not those of an upright screen."""
+        return cls(*map(int, screen.resolution), *map(float, low or screen.low), *map(float, screen.pixel))
 
 
 class Point(NamedTuple):
@@ -58,6 +58,40 @@ class Point(NamedTuple):
     steps: int
     scale: float
     emission: np.ndarray
+
+
+class Components(NamedTuple):
+    """Components of a vector."""
+
+    x: float
+    y: float
+    z: float
+
+
+class ParallelLight(NamedTuple):
+    """Parallel light behind a flat entrance, for the rays of `beam`, and the plane of the screen.
+
+    kx, ky: k; long2: L^2; power: E T, 1/mm^2; over_x, over_y: 1 / half widths of the entrance, 1/mm; round: whether its aperture is
+    a circle; e1, e2, e3: axes of the screen, the third its normal; c1, c2, c3: a point of it along these, mm, where its coordinates
+    are 0, above the zero of the sag; on1, on2, on3: D along these.
+    """
+
+    kx: float
+    ky: float
+    long2: float
+    power: float
+    over_x: float
+    over_y: float
+    round: bool
+    e1: Components
+    e2: Components
+    e3: Components
+    c1: float
+    c2: float
+    c3: float
+    on1: float
+    on2: float
+    on3: float
 
 
 class Splat(NamedTuple):

@@ -5,14 +5,14 @@ Everything is float64, since float32 was no faster.
 
 Each of a fixed number of blocks of rows accumulates an image of its own, and these are added in order, so the result depends on the
 number of blocks (threads) but not on timing.  Only the scatter to and the gather from pixels are per ray; the rest (`rows`,
-`axial_refraction` or `oblique_refraction`, `filter_weights`) is vectorised over rows.
+`axial_refraction`, `oblique_refraction`, `pencil` or `beam`, `filter_weights`) is vectorised over rows.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from caustic_cli.optics.kernels import axial_refraction, oblique_refraction, pencil
+from caustic_cli.optics.kernels import axial_refraction, beam, oblique_refraction, pencil
 from caustic_cli.optics.kernels import rows as row
 from caustic_cli.optics.kernels.arguments import Splat
 from caustic_cli.optics.kernels.jit import FAST, SUMS, njit
@@ -24,9 +24,12 @@ LOST_BY_FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # o
 
 
 @njit(inline="always", **FAST)
-def _aim(v, i, surface, rays, exit_, frame, oblique, point):
+def _aim(v, i, surface, rays, exit_, frame, oblique, point, parallel):
     """Powers and landing points of row i."""
-    if point is not None:
+    if parallel is not None:
+        combine(i, surface, v[row.SAG], v[row.GX], v[row.GY])
+        beam.aim(v, i, rays, exit_, frame, parallel)
+    elif point is not None:
         combine(i, surface, v[row.SAG], v[row.GX], v[row.GY])
         pencil.aim(v, i, rays, exit_, frame, point)
     elif oblique is None:
@@ -78,17 +81,17 @@ def _cut(scratch, vx, vy):
 
 
 @njit(entry=True, **FAST)
-def forward(block, images, ledgers, scratch, surface, rays, exit_, frame, splat, oblique, point):
+def forward(block, images, ledgers, scratch, surface, rays, exit_, frame, splat, oblique, point, parallel):
     """Ledgers (blocks, COLUMNS) of the losses, and partial images, whose `pixels.total` is the padded image.
 
     images (blocks, n_x + 4 r_x, n_y + 4 r_y, and -v_y % 4 more), ledgers and scratch (blocks, `scratch_rows`, b) are overwritten;
     they set the number of blocks.
 
     surface, rays, exit_, frame, splat: as in `arguments`.  oblique: True for rays of any direction; point: of rays from one, see
-    `pencil`; both None for rays along z.  Each is compiled apart.
+    `pencil`; parallel: of parallel rays at an angle to z, see `beam`; all None for rays along z.  Each is compiled apart.
     """
     if block == ALL:
-        on_threads(len(images), (images, ledgers, scratch, surface, rays, exit_, frame, splat, oblique, point))
+        on_threads(len(images), (images, ledgers, scratch, surface, rays, exit_, frame, splat, oblique, point, parallel))
         return
     rows, blocks = len(rays.x), len(images)
     images[block] = 0.0
@@ -96,14 +99,14 @@ def forward(block, images, ledgers, scratch, surface, rays, exit_, frame, splat,
     v, sx, sy, dx, dy = _cut(scratch[block], splat.size_x, splat.size_y)
     column = np.zeros(splat.size_y + -splat.size_y % 4)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        _aim(v, i, surface, rays, exit_, frame, oblique, point)
+        _aim(v, i, surface, rays, exit_, frame, oblique, point, parallel)
         _account(v, ledgers[block])
         share(v, splat, sx, sy, dx[:0], dy[:0])
         ledgers[block, OFF_SCREEN] += scatter(v, v.shape[1], frame, splat, sx, sy, images[block], column)
 
 
 @njit(entry=True, **FAST)
-def backward(block, grad, grad_leaving, apart, nets, scratch, surface, rays, exit_, frame, splat, oblique, point):
+def backward(block, grad, grad_leaving, apart, nets, scratch, surface, rays, exit_, frame, splat, oblique, point, parallel):
     """Adjoint of `forward`: derivatives by the three nets, from those by the padded image and leaving power.
 
     nets (3, 1 if apart else blocks, n, b) are overwritten: the `pixels.total` of each is the derivative by a net (n, b).
@@ -114,7 +117,9 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, surface, rays, exi
     if block == ALL:
         if apart and oblique is None:
             nets[:] = 0.0
-        on_threads(len(scratch), (grad, grad_leaving, apart, nets, scratch, surface, rays, exit_, frame, splat, oblique, point))
+        on_threads(
+            len(scratch), (grad, grad_leaving, apart, nets, scratch, surface, rays, exit_, frame, splat, oblique, point, parallel)
+        )
         return
     rows, blocks = len(rays.x), len(scratch)
     if not apart:
@@ -122,11 +127,14 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, surface, rays, exi
     v, sx, sy, dx, dy = _cut(scratch[block], splat.size_x, splat.size_y)
     column, tilt = np.zeros(splat.size_y + -splat.size_y % 4), np.zeros(splat.size_y + -splat.size_y % 4)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        _aim(v, i, surface, rays, exit_, frame, oblique, point)
+        _aim(v, i, surface, rays, exit_, frame, oblique, point, parallel)
         _remove_lost(v[row.POWER])
         share(v, splat, sx, sy, dx, dy)
         gather(v, v.shape[1], frame, splat, sx, sy, dx, dy, grad, grad_leaving, grad_leaving, column, tilt)
-        if point is not None:
+        if parallel is not None:
+            beam.pull(v, i, rays, exit_, parallel)
+            spread(i, surface, v[row.BY_SAG], v[row.BY_GX], v[row.BY_GY], nets[:, 0 if apart else block], apart)
+        elif point is not None:
             pencil.pull(v, i, rays, exit_, point)
             spread(i, surface, v[row.BY_SAG], v[row.BY_GX], v[row.BY_GY], nets[:, block], False)
         elif oblique is None:

@@ -13,17 +13,31 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks, fused, pixels, random_points
-from caustic_cli.optics.kernels.arguments import Exit, Point, RowsOfRays, RowsOfSurface, ScreenFrame, Splat
+from caustic_cli.optics.kernels.arguments import (
+    Components,
+    Exit,
+    ParallelLight,
+    Point,
+    RowsOfRays,
+    RowsOfSurface,
+    ScreenFrame,
+    Splat,
+)
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.fresnel import FRESNEL
 from caustic_cli.optics.kernels.ray_intersections import RayIntersections
 from caustic_cli.optics.kernels.splat import trimmed
 from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
 from caustic_cli.optics.kernels.threads import ALL
+from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
+
+#: A source point, or parallel light at an angle to z; neither for other rays.
+Light = tuple[Point | None, ParallelLight | None]
 
 
 class _Workspace:
@@ -79,13 +93,49 @@ class PlaneKernel:
 
     def __call__(self, sag: Tensor, eta: float, fresnel: str, height: float, screen: Screen, filter: Filter):
         """Control heights (n, m) float64 relative to some plane, mm, and the screen's height above it, mm: see `_splat`."""
+        return self._splatted(sag, (eta, fresnel), (0.0, height), screen, filter)
+
+    def _splatted(
+        self, sag: Tensor, interface: tuple[float, str], ends: tuple[float, float], screen: Screen, filter: Filter, *light
+    ):
+        """`_splat` of the surface at the rays; light: its last arguments."""
         nets: Sequence[Tensor]
         if self.tensor:
             net, net_y = self.along_v(sag)  # (n, m_v)
             nets = (net, net, net_y)
         else:
             nets = [t.view(self.shape) for t in scattered_surface(self.surface, sag, *self.points)]
-        return _splat(nets, self.rows, not self.tensor, self.rays, (eta, fresnel), (0.0, height), screen, filter, self.workspace)
+        return _splat(nets, self.rows, not self.tensor, self.rays, interface, ends, screen, filter, self.workspace, *light)
+
+
+class BeamKernel(PlaneKernel):
+    """The same for parallel rays at an angle to z, and a plane screen of any orientation: see `optics.beam`.
+
+    Args:
+        beam: the rays; entrance: its n and kind of Fresnel losses.
+    """
+
+    def __init__(self, spaces, half_size, beam: Beam, entrance: tuple[float, str], like: BeamKernel | None = None):
+        sample = beam.sample
+        super().__init__(spaces, half_size, sample.u, sample.v, sample.tensor, sample.flux, like)
+        self.z_in, (self.kx, self.ky), self.half_size = beam.z_in, beam.inside(entrance[0]), beam.aperture.half_size
+        self.round, self.power = bool(beam.aperture.round), beam.irradiance * beam.transmittance(*entrance)
+
+    def onto(self, sag: Tensor, eta: float, fresnel: str, reference: float, receiver: Receiver, filter: Filter):
+        """Control heights (n, m) float64 relative to `reference`, mm: see `_splat`."""
+        light, frame = (None, self._light(receiver, reference)), ScreenFrame.of(receiver.screen, receiver.low)
+        ends = self.z_in - reference, 0.0
+        return self._splatted(sag, (eta, fresnel), ends, receiver.screen, filter, light, frame)
+
+    def _light(self, receiver: Receiver, reference: float) -> ParallelLight:
+        kx, ky = self.kx, self.ky
+        middle = (*receiver.middle[:2], receiver.middle[2] - reference)
+        e1, e2, e3 = (Components(*map(float, axis)) for axis in receiver.axes)
+        c1, c2, c3 = (float(dot(middle, axis)) for axis in receiver.axes)
+        on1, on2, on3 = (float(dot((kx, ky, 1.0), axis)) for axis in receiver.axes)
+        over_x, over_y = (1.0 / r for r in self.half_size)
+        long2 = 1.0 + kx * kx + ky * ky
+        return ParallelLight(kx, ky, long2, self.power, over_x, over_y, self.round, e1, e2, e3, c1, c2, c3, on1, on2, on3)
 
 
 class RayKernel:
@@ -185,7 +235,9 @@ class PencilKernel:
         )
         net, net_y = self.along_v(sag)
         ends = self.z_in - reference, screen.z - reference
-        return _splat((net, net, net_y), self.rows, False, self.rays, (eta, fresnel), ends, screen, filter, self.workspace, point)
+        return _splat(
+            (net, net, net_y), self.rows, False, self.rays, (eta, fresnel), ends, screen, filter, self.workspace, (point, None)
+        )
 
 
 #: Largest number of Newton steps, and the relative size of a step that is not taken, since the next would be its square.
@@ -202,15 +254,16 @@ def _splat(
     screen: Screen,
     filter: Filter,
     workspace: _Workspace,
-    point: Point | None = None,
+    light: Light = (None, None),
+    frame: ScreenFrame | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; ends: heights of oblique rays' origins
-    and of the screen, mm; point: of rays from one.
+    and of the screen, mm; light: of rays from a point, or parallel ones; frame: of the pixels, if not that of an upright screen.
 
     Returns:
         image (n_x, n_y) and the power behind the lens (), float64, differentiable; losses by name.
     """
-    arguments = _arguments(rays, interface, ends, screen, filter, point)
+    arguments = _arguments(rays, interface, ends, frame or ScreenFrame.of(screen), filter, light)
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
     image, beside = trimmed(padded, screen, filter)
     lost = {"missed_surface": ledger[fused.MISSED]} if rays.along_x is not _NONE else {}
@@ -228,14 +281,14 @@ def _arguments(
     rays: RowsOfRays,
     interface: tuple[float, str],
     ends: tuple[float, float],
-    screen: Screen,
+    frame: ScreenFrame,
     filter: Filter,
-    point: Point | None = None,
+    light: Light = (None, None),
 ) -> tuple:
     """The arguments of the `fused` kernels after the surface."""
     eta, fresnel = interface
     exit_ = Exit(float(eta), FRESNEL[fresnel], *map(float, ends))
-    return rays, exit_, ScreenFrame.of(screen), Splat.of(filter), None if rays.along_x is _NONE else True, point
+    return rays, exit_, frame, Splat.of(filter), None if rays.along_x is _NONE else True, *light
 
 
 def _layout(count: int) -> tuple[int, int]:
@@ -284,7 +337,7 @@ def _example() -> tuple:
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2, dtype=torch.float64)
     kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, True, torch.tensor(0.25, dtype=torch.float64))
     net, screen = torch.zeros(4, 2, dtype=torch.float64), Screen((10.0, 10.0), 10.0, (4, 4))
-    arguments = _arguments(kernel.rays, (1.5, "exact"), (0.0, 10.0), screen, Filter("cosine", (3, 3)))
+    arguments = _arguments(kernel.rays, (1.5, "exact"), (0.0, 10.0), ScreenFrame.of(screen), Filter("cosine", (3, 3)))
     return net, net, net, kernel.rows, False, arguments, kernel.workspace
 
 

@@ -31,8 +31,8 @@ def aimed_rays(
     a ray moves back towards its last unblocked position, or else towards the centre of the light.
     """
     x, y = at
-    u, v = ((c - seen.offset[k]) / seen.scale[k] for k, c in enumerate(at))
-    middle = [(0.5 * (seen.light[0][k] + seen.light[1][k]) - seen.offset[k]) / seen.scale[k] for k in (0, 1)]
+    u, v = seen.toward(*(c - o for c, o in zip(at, seen.offset, strict=True)))
+    middle = seen.toward(*(0.5 * (seen.light[0][k] + seen.light[1][k]) - seen.offset[k] for k in (0, 1)))
     found, behind = torch.zeros_like(x, dtype=torch.bool), torch.zeros_like(x, dtype=torch.bool)
     held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
     f: Any = None
@@ -55,7 +55,7 @@ def aimed_rays(
         far = inside & (0.5 * ((x - f.x).square() + (y - f.y).square()) * curvature > left)
         if not bool(far.any()) and (k + 1 >= AT_EDGES or not bool(behind.any())):
             break
-        ahead = (here[0] + (x[some] - new.x) / seen.scale[0], here[1] + (y[some] - new.y) / seen.scale[1])
+        ahead = [h + move for h, move in zip(here, seen.toward(x[some] - new.x, y[some] - new.y), strict=True)]
         for c, a, h, kept, m in zip((u, v), ahead, here, held, middle, strict=True):
             c[some] = torch.where(lit, a, torch.where(ever, 0.5 * (h + kept[some]), h + INWARDS * (m - h)))
         some = (far | ~inside).nonzero()[:, 0]

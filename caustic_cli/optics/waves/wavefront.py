@@ -53,6 +53,8 @@ CROSSES = (
     "rays cross within the depth of the lens, so that the light behind it has no single wavefront; a flatter surface or a screen"
     " farther away has one"
 )
+#: Part of the scale up to which the skew of the map from pupil to intercepts is left to the iterations of ray aiming.
+STRAIGHT = 0.05
 #: Tolerated displacement from the grid at the edges of dark regions, in cells.
 AT_EDGE = 0.05
 #: Rays per chunk.
@@ -172,7 +174,8 @@ class Survey:
     """Extent of the light, from a coarse grid of rays.
 
     light, landing: lower and upper limits of intercepts and of landing points, mm; offset, scale: linear fit x = offset + scale u
-    from the pupil's u and v, in [0, 1], to intercepts along each axis; magnification: square root of the mean area of landing
+    from the pupil's u and v, in [0, 1], to intercepts along each axis; skew: and their change along the other one, 0 where it is
+    small; magnification: square root of the mean area of landing
     points over that of intercepts; mostly: limits of landing points without the fraction FEW of rays on each side.
     """
 
@@ -182,6 +185,15 @@ class Survey:
     scale: tuple[float, float]
     magnification: float
     mostly: tuple
+    skew: tuple[float, float] = (0.0, 0.0)
+
+    def toward(self, x, y) -> tuple:
+        """Changes of u and v for changes of the intercepts, mm, tensors or numbers."""
+        (a, d), (b, c) = self.scale, self.skew
+        if not (b or c):
+            return x / a, y / d
+        over = 1.0 / (a * d - b * c)
+        return over * (d * x - b * y), over * (a * y - c * x)
 
 
 @torch.no_grad()
@@ -204,7 +216,7 @@ def survey(optics: Optics) -> Survey:
     )
     scale, offset, lows, highs = [], [], [], []
     for k, (at, foot) in enumerate(((u[lit], f.x[lit]), (v[lit], f.y[lit]))):
-        a, b = at - at.mean(), foot - foot.mean()
+        a, b = _centred(at, foot)
         scale.append(float((a * b).sum() / (a * a).sum()))
         offset.append(float(foot.mean() - scale[-1] * at.mean()))
         low, high = light[0][k], light[1][k]
@@ -218,13 +230,22 @@ def survey(optics: Optics) -> Survey:
         lows.append(low)
         highs.append(high)
     light = (tuple(lows), tuple(highs))
+    skew = [float((a * b).sum() / (a * a).sum()) for a, b in (_centred(v[lit], f.x[lit]), _centred(u[lit], f.y[lit]))]
+    if max(map(abs, skew)) <= STRAIGHT * min(map(abs, scale)):
+        skew = [0.0, 0.0]
+    offset = [o - s * float(at[lit].mean()) for o, s, at in zip(offset, skew, (v, u), strict=True)]
     grid = (SURVEY, SURVEY)
     area = _jacobian(f.big_x.view(grid), f.big_y.view(grid), 1.0, 1.0).abs()
     foot = _jacobian(f.x.view(grid), f.y.view(grid), 1.0, 1.0).abs()
     weight = f.power.view(grid)
     magnification = float((weight * area).sum() / (weight * foot).sum()) ** 0.5
     mostly = tuple(tuple(float(torch.quantile(c[lit], q)) for c in (f.big_x, f.big_y)) for q in (FEW, 1.0 - FEW))
-    return Survey(light, landing, (offset[0], offset[1]), (scale[0], scale[1]), magnification, mostly)
+    return Survey(light, landing, (offset[0], offset[1]), (scale[0], scale[1]), magnification, mostly, (skew[0], skew[1]))
+
+
+def _centred(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Without their means."""
+    return a - a.mean(), b - b.mean()
 
 
 def _jacobian(a: Tensor, b: Tensor, dx: float, dy: float) -> Tensor:

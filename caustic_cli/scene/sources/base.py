@@ -2,7 +2,8 @@
 
 A source is one of three kinds:
     collimated   all rays are parallel to +z, so they can be sampled on the surface itself
-    distant      at infinity: it has no position, and its rays make an angle of at most half_angle with +z (0 if collimated)
+    distant      at infinity: it has no position, and its rays make an angle of at most half_angle with its axis (0 if they are
+    parallel)
     near         at a finite distance in front of the lens: one or several positions, each with an extent, emitting into a cone
     about +z, or about another axis
 
@@ -34,9 +35,9 @@ class Source:
     kind: name of its type in [source] type; power: emitted into the cone, or through the aperture for a distant source; profile:
     relative irradiance over the aperture, (a, b), or None if uniform; cone: half-angle of the emission cone as given, degrees, or
     None for the narrowest that covers the lens; intensity: uniform in solid angle, lambertian, or tabulated; aimed: rays are
-    sampled over the lens instead of over the whole cone; axis: of the cone of a near source and of its intensity, a unit vector, +z
-    except where errors of alignment tilt it; collimated: see the module; rays: ray set of a file, None for a source
-    that is sampled;
+    sampled over the lens instead of over the whole cone; axis: a unit vector, the direction of light from infinity, or the axis of
+    the cone of a near source and of its intensity, +z except where errors of alignment tilt it; collimated: see the module; rays:
+    ray set of a file, None for a source that is sampled;
     brightness: relative radiance over `frame`, (a, b) [i, j], or None if uniform over an ellipse; spectra: of several sources,
     wavelengths, nm, and relative powers of each; measures: and the continuous spectrum that these are samples of, or None.
     """
@@ -87,8 +88,13 @@ class Source:
         return self.collimated
 
     @property
+    def parallel(self) -> bool:
+        """Whether all its rays are parallel."""
+        return self.collimated or (len(self.members) == 1 and self.distant and self.half_angle == 0)
+
+    @property
     def half_angle(self) -> float:
-        """Largest angle of a distant source's rays to z."""
+        """Largest angle of a distant source's rays to its axis."""
         return 0.0
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
@@ -236,7 +242,7 @@ class Source:
     def incidence(self, pupil: Pupil) -> float:
         """Upper bound of the angle to z of its rays into the aperture, rad."""
         if self.distant:
-            return self.half_angle
+            return min(self.half_angle + self.lean, math.pi / 2.0)
         return min(self.cone_over(pupil) + self.lean, self._covering(pupil))
 
     @property

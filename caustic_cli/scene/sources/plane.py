@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.scene.screen import tilted
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.section import SourceType, Table
 from caustic_cli.schema.table import check
@@ -14,19 +16,25 @@ from caustic_cli.schema.table import check
 
 @dataclass(frozen=True, eq=False)
 class PlaneWave(Source):
-    """A collimated beam at normal incidence on the entrance, as wide as the lens' aperture."""
+    """A beam of parallel rays that fills the aperture of the entrance, at normal incidence unless it is tilted."""
 
     #: Power through the aperture, W.
     power: float = 1.0
     #: Optional relative irradiance E over the aperture, (a, b) non-negative, [i, j] with i along +x and j along +y, constant on
     #: each cell (eq. 4.2.3, erratum E19); None for uniform irradiance.
     profile: np.ndarray | None = None
+    #: Right-handed rotations of its direction +z, first about the fixed x axis, then about the fixed y axis, degrees.
+    tilt: tuple[float, float] = (0.0, 0.0)
+    #: That direction, a unit vector.
+    axis: tuple[float, float, float] = field(init=False, default=(0.0, 0.0, 1.0))
 
     kind = "plane"
-    collimated = True
+    distant = True
 
     def __post_init__(self):
         check("source.power", self.power)
+        check_tilt(self.tilt)
+        object.__setattr__(self, "axis", tilted(self.tilt)[2])
         if self.profile is not None:
             e = np.asarray(self.profile, dtype=float)
             with np.errstate(over="ignore"):
@@ -35,13 +43,42 @@ class PlaneWave(Source):
                 raise InputError("⟨source.profile⟩ must be a 2-D picture, finite, not negative, and not black all over")
             object.__setattr__(self, "profile", e)
 
+    @property
+    def collimated(self) -> bool:
+        """As of a source."""
+        return not any(self.tilt)
+
+    @property
+    def emission(self) -> str:
+        """As of a source."""
+        return "plane" if self.collimated else "tilted plane"
+
     def extent_words(self, z_in: float) -> str:
         """As of a source."""
         return "a plane wave has one direction"
 
 
+#: Largest angle of light to +z, degrees: beyond it a flat face reflects more than half of it, and the beam is a fifth as wide.
+GRAZING = 80.0
+
+
+def check_tilt(tilt: tuple[float, float]) -> None:
+    """Check the direction of light from infinity.
+
+    Raises:
+        InputError: it grazes the entrance, or does not reach it.
+    """
+    check("source.tilt", tilt)
+    angle = math.degrees(math.acos(min(1.0, tilted(tilt)[2][2])))
+    if not angle <= GRAZING:
+        raise InputError(
+            f"⟨source.tilt⟩ must keep the light within {GRAZING:g} degrees of +z, got {angle:.3g}: at grazing incidence the"
+            " entrance reflects it, and beyond 90 degrees it comes from behind"
+        )
+
+
 def _plane(table: Table, profile: np.ndarray | None) -> PlaneWave:
-    return PlaneWave(table["power"], profile)
+    return PlaneWave(table["power"], profile, tuple(table["tilt"]))
 
 
-TYPES = (SourceType("plane", "plane (as wide as the lens)", ("profile",), _plane),)
+TYPES = (SourceType("plane", "plane (as wide as the lens)", ("profile", "tilt"), _plane),)
