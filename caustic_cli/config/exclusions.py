@@ -61,6 +61,12 @@ EXCLUDED: dict[str, dict[str, str]] = {
         ),
         "design.waves on": WAVE_REFINEMENT.unsupported["gradient index"],
     },
+    "source.tilt": {
+        **dict.fromkeys(
+            (*TRAITS["two sides"].settings, "lens.mirror", "lens.gradient", "lens.array", "element", "source.also", "design.over"),
+            "⟨source.tilt⟩ is for one lens with a flat entrance and one source, without ⟨{path}⟩",
+        ),
+    },
     "design.over": {"design.robust": "⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already"},
 }
 #: Feature -> settings of which it needs one -> message.

@@ -138,7 +138,10 @@ class Paraxial:
 
 PARAXIAL = Capability(
     "paraxial estimates by the exit",
-    dict.fromkeys(("two sides", "other elements"), "the exit alone does not determine where light lands"),
+    {
+        **dict.fromkeys(("two sides", "other elements"), "the exit alone does not determine where light lands"),
+        "tilted light": "they are those of light near the axis",
+    },
 )
 
 

@@ -150,6 +150,7 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -
 THROW = Capability(
     "advice on the throw of a thinner plate",
     {
+        "tilted light": "the throw is not along the axis",
         "near source": "the relief collects the light of the source, whatever the throw",
         "mirror": "its relief is not that of a sheet",
         "other elements": "they decide the throw, too",

@@ -64,6 +64,7 @@ VERIFICATION = Capability(
             ("ray file", "several sources", "user-defined source"),
             "⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}",
         ),
+        "tilted light": "⟨verify⟩ mitsuba traces plane waves along the axis, not tilted ones",
         "approximate Fresnel": "⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}",
     },
 )

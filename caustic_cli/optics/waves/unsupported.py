@@ -46,7 +46,7 @@ WAVES_BY_DEFAULT = Capability(
         "curved screen": WAVE_IMAGE.unsupported["curved screen"],
         "lenslet array": "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on"
         " refines it",
-        "tilted screen": "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same",
+        "oblique screen": "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same",
     },
 )
 #: Of the scenes without a wave image, the limits of what is implemented, so that the effect cannot be asked for.
