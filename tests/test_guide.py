@@ -70,7 +70,7 @@ def home(tmp_path_factory):
         for name, value in SMALL.items():
             patch.setenv(name, value)
         os.chdir(directory)
-        for name in ("flame.png", "ball.png", "house.png", "array-sheet.png", "array-wanted.png"):
+        for name in ("flame.png", "tophat.png", "ball.png", "house.png", "array-sheet.png", "array-wanted.png"):
             shutil.copy(ROOT / "examples" / name, directory)
         shutil.copytree(ROOT / "examples" / "thesis", directory / "thesis")
         for name in ("globe.toml", "folded.toml"):

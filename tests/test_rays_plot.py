@@ -9,13 +9,13 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli
+from caustic_cli import cli, load
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.elements import FoldMirror
-from caustic_cli.studies.rays_plot import MOST, OFF_SCREEN, check_count, trace_paths, write_plot
+from caustic_cli.studies.rays_plot import MOST, OFF_SCREEN, check_count, seen_across, trace_paths, write_plot
 
 INDEX = 1.5
 LENS = Lens((10.0, 8.0), control=(9, 8), index=INDEX, offset=Offset(4.0, (30.0, 30.0)))
@@ -126,3 +126,44 @@ def test_the_command_writes_it_beside_the_image(tmp_path, monkeypatch, capfd):
     assert not Path("b.png").exists()
     Path("c-rays.png").write_bytes(b"not of this program")
     assert cli.run([*asked[:-1], "c.png", "--rays-plot", "5"]) == 2 and Path("c-rays.png").read_bytes() == b"not of this program"
+
+
+def test_rays_that_a_mirror_folds_along_x_are_seen_from_above():
+    assert seen_across(paths_of()) == 1
+    assert [seen_across(paths_of(elements=(FoldMirror(40.0, (60.0, 60.0), tilt=t),))) for t in ((45.0, 0.0), (0.0, 45.0))] == [1, 0]
+
+
+def test_a_plot_of_many_rays_shows_where_light_is_dense(tmp_path):
+    """The side view before the lens keeps its paper between the rays: 625 of them do not make one opaque block."""
+    write_plot(tmp_path / "many.png", paths_of(625))
+    pixels = np.asarray(Image.open(tmp_path / "many.png").convert("RGB")).astype(int)[40:310, 100:770]
+    blue = pixels[(pixels[..., 2] - pixels[..., 0]) > 8]
+    assert len(blue) > 2000 and len(np.unique(blue[:, 0])) > 30 and np.percentile(blue[:, 0], 50) > 0x3A + 20
+
+
+def test_the_plot_of_a_gradient_index_lens_an_array_and_several_lenses(tmp_path, monkeypatch, capfd):
+    """From designs: every ray is drawn, with two vertices on each lens; files of another program stay unless forced."""
+    monkeypatch.chdir(tmp_path)
+    picture = np.zeros((16, 16), np.uint8)
+    picture[4:12, 4:12] = 255
+    Image.fromarray(picture).save("square.png")
+    kinds = {
+        "graded": (["--gradient", "radial", "--gradient-terms=-1e-3"], 4),
+        "array": (["--array", "2x2"], 4),
+        "mirror": (["--mirror"], 3),
+        "several": (["--element", "lens z=-20 thickness=4 radius=150,inf glass=N-BK7"], 6),
+    }
+    small = ["--resolution", "16", "--waves", "off", "--iterations", "1", "--quality", "draft", "--quiet"]
+    for name, (more, vertices) in kinds.items():
+        assert cli.run(["design", "square.png", *small, *more, "-o", f"{name}.caustic"]) == 0
+        lens = load(f"{name}.caustic")
+        assert trace_paths(lens.scene, lens.field, lens.heights, 40).vertices.shape == (40, vertices, 3)
+        capfd.readouterr()
+        asked = ["render", f"{name}.caustic", "--rays", "2000", "--rays-plot", "40", "--quiet", "--json"]
+        assert cli.run(asked) == 0 and json.loads(capfd.readouterr().out)["rays_plot"]["rays"] == 40
+    plot = Path("mirror.caustic/rays.png")
+    own = plot.read_bytes()
+    plot.write_bytes(b"not of this program")
+    asked = ["render", "mirror.caustic", "--rays", "2000", "--rays-plot", "40", "--quiet"]
+    assert cli.run(asked) == 2 and plot.read_bytes() == b"not of this program"
+    assert cli.run([*asked, "--force"]) == 0 and plot.read_bytes() == own

@@ -46,6 +46,8 @@ WAYS = {
 STUB = 0.15
 #: Cosine to the normal of a plane below which a ray is not continued to it.
 GRAZING = 0.1
+#: Ratio of their extents along x and y from which rays are seen from above instead of from the side.
+FROM_ABOVE = 2.0
 #: Colours of rays on the screen and of lost ones.
 ARRIVED, LOST = "#3a6ea5", "#d1495b"
 
@@ -162,8 +164,20 @@ def _in_space(receiver: Receiver, landed: RayState) -> tuple[np.ndarray, np.ndar
     return np.array(receiver.middle) + local @ np.array(receiver.axes), ((xy < low) | (xy > high)).any(1)
 
 
+def seen_across(paths: Paths) -> int:
+    """The axis, 0 for x or 1 for y, that is drawn over z: y, unless rays and screen extend `FROM_ABOVE` times as far along x, as
+    where a mirror folds them that way."""
+    spans = np.ptp(np.concatenate([paths.vertices.reshape(-1, 3), paths.screen]), axis=0)
+    return int(spans[0] < FROM_ABOVE * spans[1])
+
+
+def _opacity(rays: int) -> float:
+    """Opacity of each of so many lines of one colour: where many lie over each other it shows how many."""
+    return float(np.clip(45.0 / max(rays, 1), 0.04, 0.9))
+
+
 def write_plot(path: Path, paths: Paths) -> None:
-    """Write a PNG: the side view of all, that of the surfaces, and all in three dimensions."""
+    """Write a PNG: the side view of all (`seen_across`), that of the surfaces, and all in three dimensions, with landing points."""
     from matplotlib.collections import LineCollection  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
     from mpl_toolkits.mplot3d.art3d import Line3DCollection  # noqa: PLC0415
@@ -172,37 +186,39 @@ def write_plot(path: Path, paths: Paths) -> None:
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
     whole, near = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     space = figure.add_subplot(grid[:, 1], projection="3d")
-    opacity, f = float(np.clip(30.0 / len(paths.status) ** 0.75, 0.08, 0.9)), paths.figures
+    f = paths.figures
     surfaces = paths.vertices[np.isin(paths.status, (RayStatus.OK, OFF_SCREEN))][:, 1:-1].reshape(-1, 3)
-    edge = np.concatenate([paths.screen, paths.screen[:1]])
+    edge, across = np.concatenate([paths.screen, paths.screen[:1]]), seen_across(paths)
     for lost, colour, label in ((False, ARRIVED, "on the screen"), (True, LOST, "lost")):
         rays = paths.vertices[paths.lost == lost]
-        style = {"colors": colour, "linewidths": 0.7, "alpha": opacity}
+        style = {"colors": colour, "linewidths": 0.7, "alpha": _opacity(len(rays))}
         for axis in (whole, near):
-            axis.add_collection(LineCollection(list(rays[:, :, [2, 1]]), **style))
+            axis.add_collection(LineCollection(list(rays[:, :, [2, across]]), **style))
         if len(rays):
             space.add_collection3d(Line3DCollection(list(rays[:, :, [2, 0, 1]]), **style))
+            landed = rays[np.isin(paths.status[paths.lost == lost], (RayStatus.OK, OFF_SCREEN)), -1]
+            space.scatter(*landed[:, [2, 0, 1]].T, s=4, color=colour, linewidths=0, depthshade=False)
         whole.plot([], [], color=colour, label=f"{label}: {len(rays)}")
     for axis in (whole, near):
-        axis.plot(surfaces[:, 2], surfaces[:, 1], ".", color="0.25", markersize=2)
-        axis.plot(edge[:, 2], edge[:, 1], color="black", linewidth=2)
-        axis.set(xlabel="z (mm)", ylabel="y (mm)")
+        axis.plot(surfaces[:, 2], surfaces[:, across], ".", color="0.25", markersize=2)
+        axis.plot(edge[:, 2], edge[:, across], color="black", linewidth=2)
+        axis.set(xlabel="z (mm)", ylabel=f"{'xy'[across]} (mm)")
     whole.autoscale_view()
-    whole.set_title("side view")
-    whole.legend(loc="upper left")
+    whole.set_title(("view from above", "side view")[across], loc="left")
+    whole.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
     meets = surfaces if len(surfaces) else paths.vertices[:, 1]
     low, high = meets.min(0), meets.max(0)
     room = 0.15 * (high - low) + 0.1 * (high - low).max() + 1e-3
-    near.set(
-        title="at the surfaces, to scale", xlim=(low[2] - room[2], high[2] + room[2]), ylim=(low[1] - room[1], high[1] + room[1])
-    )
+    near.set_title("at the surfaces, to scale", loc="left")
+    near.set(xlim=(low[2] - room[2], high[2] + room[2]), ylim=(low[across] - room[across], high[across] + room[across]))
     near.set_aspect("equal", adjustable="datalim")
     space.plot(edge[:, 2], edge[:, 0], edge[:, 1], color="black", linewidth=1.5)
     space.scatter(surfaces[:, 2], surfaces[:, 0], surfaces[:, 1], s=1, color="0.25")
     every = np.concatenate([paths.vertices.reshape(-1, 3), edge])
     low, high = every.min(0), every.max(0)
     space.set(xlim=(low[2], high[2]), ylim=(low[0], high[0]), zlim=(low[1], high[1]))
-    space.set(xlabel="z (mm)", ylabel="x (mm)", zlabel="y (mm)", title=f"{f['rays']} rays, {f['lost']} lost")
+    space.set(ylabel="x (mm)", zlabel="y (mm)", title=f"{f['rays']} rays, {f['lost']} lost")
+    space.set_xlabel("z (mm)", labelpad=18.0)
     space.set_box_aspect((2.0, 1.0, 1.0))
     with atomic_file(path) as file:
         figure.savefig(file, format="png", metadata={"Software": SOFTWARE})
