@@ -164,7 +164,7 @@ def _show(kind: StudyKind, found: Study, paths: list[Path], say: console.Console
         rows.insert(0, ("rays", f"{found.about['rays']:,} from {found.about['source']}"))
     if kind.of_lenses:
         rows.insert(0, ("errors", "against the picture, by rays"))
-    rows += [(row["series"], row["shown"]) for row in found.rows if "shown" in row]
+    rows += found.lines
     say.table(
         f"{found.name}: fitted orders" if found.orders else found.name,
         [*rows, ("advice", found.advice), ("written", ", ".join(map(str, paths)))],

@@ -63,6 +63,7 @@ class Study:
         about: metadata: seed, repeats, device, the reference and its error, ...
         against: column that the orders are fitted in.
         plots: suffix of the file name -> function that draws the plot.
+        table: for the terminal, the headings and a line for every row, of as many words each; empty for none.
     """
 
     name: str
@@ -73,6 +74,16 @@ class Study:
     about: dict
     against: str = "rays"
     plots: dict[str, Drawing] = field(default_factory=lambda: PLOTS)
+    table: list[tuple[str, ...]] = field(default_factory=list)
+
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """The table as pairs of its first column and the others, in columns as wide as their longest word."""
+        widths = [max(map(len, column)) for column in zip(*self.table, strict=True)]
+        return [
+            (line[0], "  ".join(word.ljust(width) for word, width in zip(line[1:], widths[1:], strict=True)).rstrip())
+            for line in self.table
+        ]
 
 
 #: Draws a study on an empty figure.

@@ -12,11 +12,13 @@ from collections.abc import Callable
 from matplotlib.figure import Figure
 
 from caustic_cli.studies.report import COLOURS, Drawing, Study
-from caustic_cli.studies.stability import elements, images, light, splines, waves
+from caustic_cli.studies.stability import elements, images, light, refraction, splines, surfaces, systems, waves
 from caustic_cli.studies.stability.case import Case
 
 #: Every case, in the order of the table.
-CASES: tuple[Case, ...] = (*light.CASES, *images.CASES, *splines.CASES, *elements.CASES, *waves.CASES)
+CASES: tuple[Case, ...] = tuple(
+    case for home in (light, refraction, surfaces, images, splines, elements, systems, waves) for case in home.CASES
+)
 #: Errors below this are drawn at it.
 LEAST = 1e-17
 #: Columns of the table.
@@ -30,8 +32,10 @@ COLUMNS = {
     "bound": "largest error that counts as right",
     "holds": "whether the error is within the bound",
     "seconds": "time of the case, s",
-    "shown": "the row in words",
 }
+
+#: Those of the table on the terminal.
+HEADINGS = ("case", "naively", "here", "bound", "seconds", "error of: what goes wrong naively")
 
 
 def words(value: float) -> str:
@@ -55,15 +59,26 @@ def run_stability(progress: Callable[[int, int], None]) -> Study:
                 "error": ours if math.isfinite(ours) else None,
                 "bound": case.bound,
                 "holds": bool(ours <= case.bound),
-                "seconds": (seconds := time.perf_counter() - began),
-                "shown": f"{case.error_of}: naively {words(naive)} ({case.naively}), here {words(ours)}, bound {words(case.bound)},"
-                f" {seconds:.2f} s",
+                "seconds": time.perf_counter() - began,
             }
         )
         progress(k + 1, len(CASES))
     broken = [row["series"] for row in rows if not row["holds"]]
     advice = f"beyond their bounds: {', '.join(broken)}" if broken else f"all {len(rows)} cases are within their bounds"
-    return Study("stability", COLUMNS, rows, {}, advice, {}, plots=PLOTS)
+    return Study("stability", COLUMNS, rows, {}, advice, {}, plots=PLOTS, table=[HEADINGS, *map(in_words, rows)])
+
+
+def in_words(row: dict) -> tuple[str, ...]:
+    """The row as it is printed."""
+    ours = words(math.nan if row["error"] is None else row["error"])
+    return (
+        row["series"],
+        row["naive_words"],
+        ours,
+        words(row["bound"]),
+        f"{row['seconds']:.2f}",
+        f"{row['error_of']}: {row['naively']}",
+    )
 
 
 def draw(study: Study, figure: Figure) -> None:

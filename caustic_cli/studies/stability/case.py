@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
+
+
+def largest(errors: Iterable[float]) -> float:
+    """The largest of these errors; NaN is larger than any."""
+    return max(errors, key=lambda e: (math.isnan(e), e))
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,12 @@ class Case:
     measure: Callable[[Any], tuple[float, float]]
     settings: tuple
 
+    @cached_property
+    def errors(self) -> dict[Any, tuple[float, float]]:
+        """Setting -> errors (of the naive formula, of this program), measured once."""
+        return {setting: self.measure(setting) for setting in self.settings}
+
     def worst(self) -> tuple[float, float]:
         """The largest errors of all settings, NaN the largest of all."""
-        naive, ours = zip(*map(self.measure, self.settings), strict=True)
-        return tuple(max(errors, key=lambda e: (math.isnan(e), e)) for errors in (naive, ours))  # type: ignore[return-value]
+        naive, ours = zip(*self.errors.values(), strict=True)
+        return largest(naive), largest(ours)

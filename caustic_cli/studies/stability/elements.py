@@ -74,6 +74,7 @@ def _on_plane(start: list[Decimal], direction: list[Decimal], centre, axes) -> t
 
 
 CASES = (
+    # step doubling keeps 1e-7 of a path of 318 mm between two numbers of steps, and a fifteenth of it (2e-6 mm) to the truth
     Case(
         "SELFOC rods of 1 to 10 pitches",
         "place and slope, of the amplitude",
@@ -82,6 +83,7 @@ CASES = (
         long_rod,
         (1, 10),
     ),
+    # positive terms: a few roundings
     Case(
         "spherical screens of 1e6 to 1e9 mm",
         "way to the screen, relative",
@@ -90,6 +92,7 @@ CASES = (
         flat_sphere,
         (1e6, 1e9),
     ),
+    # roundings of 1e6 mm and of the direction (1e-10 mm), over cos(85 deg)^2
     Case(
         "screens 1 km away at 60 to 85°",
         "place on the screen, mm",

@@ -106,8 +106,12 @@ def lenslet_borders(count: int) -> tuple[float, float]:
 
 
 CASES = (
+    # sums of whole numbers below 2^53 are exact in float64; one rounding of the quotient follows
     Case("1e8 unit weights into one pixel", "the pixel, relative", "a sum in float32 stops at 2^24", 1e-12, one_pixel, (100,)),
+    # some thousand additions, each rounded by 1e-16
     Case("landing on borders of pixels", "power, relative", "shares beyond the frame are lost", 1e-12, borders, (3, 7)),
-    Case("folds", "power of a pixel", "1 / |det| is infinite there", 2.5e-4, fold, (20_000,)),
+    # two edges of a pixel, each met by up to three branches, and half a ray of 20,000 at each crossing: 6 / 40,000
+    Case("folds", "power of a pixel", "1 / |det| is infinite there", 1.5e-4, fold, (20_000,)),
+    # 10,000 additions of 1e-4, each rounded by 1e-16
     Case("borders between lenslets", "power, relative", "both neighbours have the ray", 1e-12, lenslet_borders, (3, 10)),
 )

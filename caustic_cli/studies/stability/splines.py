@@ -101,6 +101,8 @@ def rounded_off(s: SplineSpace, truth: np.ndarray) -> float:
 
 
 CASES = (
+    # a basis of positive terms: three roundings for each of p <= 9 degrees, and as many of the sums over it
     Case("knots repeated up to the degree", "value, roundings", "0 / 0 in the recursion", 100.0, repeated, (3, 5, 9)),
+    # the same for p <= 15
     Case("degrees of 9 to 15", "value, roundings", "powers of x cancel", 100.0, high_degree, (9, 15)),
 )

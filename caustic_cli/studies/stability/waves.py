@@ -39,4 +39,5 @@ def long_path(millimetres: float) -> tuple[float, float]:
     return naive, ours
 
 
+# Half a turn in float32 is rounded by 1e-7, and its cell of the phase by as much; 1e4 mm in float64 are known to 2e-8 rad.
 CASES = (Case("optical paths of 300 mm to 10 m", "phase, rad", "2 pi L / lambda in float32", 1e-5, long_path, (300.0, 1e4)),)
