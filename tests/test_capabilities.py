@@ -105,6 +105,7 @@ SCENES: dict[str, Scene] = {
     "ray file among sources": of(Several((PlaneWave(), FILE), (NONE, NONE))),
     "user-defined source": of(Ring((AT,), kind="ring")),
     "near source": of(Points((AT,))),
+    "tilted light": of(PlaneWave(tilt=(20.0, 0.0))),
     "light not parallel": of(Disc(angle=0.5)),
     "separate places": of(Several((PlaneWave(), Points((AT,))), (NONE, NONE))),
     "uneven plane wave": of(PlaneWave(profile=np.array([[1.0, 2.0], [3.0, 4.0]]))),

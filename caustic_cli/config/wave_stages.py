@@ -10,7 +10,6 @@ from caustic_cli.config.settings import Settings, build_lens, build_light, build
 from caustic_cli.effort import Effort
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.waves.sampling import A_PIXEL, FINER
-from caustic_cli.optics.waves.unsupported import WAVES_BY_DEFAULT
 from caustic_cli.scene import Scene, Source
 
 
@@ -23,10 +22,9 @@ def without_waves(s: Settings, given: bool) -> str:
         return ""
     if given:
         return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
-    scene = _scene(s, build_source(s.source))
-    if (seen := Resolution.before(scene, s.target.size)).source > seen.pixel:
+    if (seen := _resolution(s, build_source(s.source))).source > seen.pixel:
         return "that of a source whose blur is wider than a pixel takes many times as long; ⟨waves⟩ on refines it all the same"
-    excluded = why_excluded("design.waves auto", s) or WAVES_BY_DEFAULT.why_not(scene)
+    excluded = why_excluded("design.waves auto", s)
     return excluded or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; ⟨waves⟩ on takes it"
 
 
@@ -37,9 +35,8 @@ def wave_stages(s: Settings, source: Source, effort: Effort, lit: tuple[float, f
         refuse_excluded("design.waves on", s)
     elif asked == "off" or why_excluded("design.waves auto", s):
         return []
-    scene = _scene(s, source)
-    seen = Resolution.before(scene, s.target.size)
-    if asked == "auto" and (seen.source > seen.pixel or not seen.matters or not WAVES_BY_DEFAULT.supports(scene)):
+    seen = _resolution(s, source)
+    if asked == "auto" and (seen.source > seen.pixel or not seen.matters):
         return []
     light = build_light(s)
     own, whole = tuple(map(float, s.source.get("wavelengths", ()))), light.continuum
@@ -48,9 +45,10 @@ def wave_stages(s: Settings, source: Source, effort: Effort, lit: tuple[float, f
     return [on_waves(lens.control, own if own or whole is None else whole.rule(count)[0], apron, n) for count, n in plan]
 
 
-def _scene(s: Settings, source: Source) -> Scene:
-    """The scene of complete settings, without other elements."""
-    return Scene(source, build_lens(s.lens), build_screen(s.screen), build_light(s))
+def _resolution(s: Settings, source: Source) -> Resolution:
+    """The resolution limit of complete settings."""
+    scene = Scene(source, build_lens(s.lens), build_screen(s.screen), build_light(s))
+    return Resolution.before(scene, s.target.size)
 
 
 def wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:

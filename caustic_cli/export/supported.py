@@ -16,7 +16,6 @@ ONE_SIDE = (
     " or ⟨mould⟩"
 )
 ONE_LENS = f"⟨format⟩ {{format}} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
-TILTED = "⟨format⟩ {format} holds light along the axis, not tilted light; solids and height maps do not hold any"
 SHAPE = (
     "⟨format⟩ {format} holds one index, and this lens' varies;"
     f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold its shape alone"
@@ -26,14 +25,14 @@ SOURCE = "⟨format⟩ {format} does not support sources of type {scene.source.k
 #: Beyond what ONE_INDEX and TWO_SIDED say.
 _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     "zemax": {"other elements": ONE_LENS},
-    "lighttools": {"user-defined source": SOURCE, "tilted light": TILTED},
+    "lighttools": {"user-defined source": SOURCE},
     "mitsuba": {
         **dict.fromkeys(
             [name for name in BEYOND_CLEAR if name not in ("mirror", "gradient index", "shifted screen")],
             "⟨format⟩ mitsuba is written for clear lenses and straight screens, not {}",
         ),
         **dict.fromkeys(("ray file", "several sources", "user-defined source"), SOURCE),
-        "tilted light": TILTED,
+        "tilted light": "⟨format⟩ mitsuba: its collimated emitter is along the axis, so tilted light cannot be written",
         "uneven plane wave": "⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written",
         **dict.fromkeys(
             ("disc at infinity", "disc not Lambertian", "disc in a cone"),

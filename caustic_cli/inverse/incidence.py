@@ -27,9 +27,8 @@ from scipy.interpolate import RegularGridInterpolator
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.relay import trace_through, without_apertures, without_freeforms
 from caustic_cli.inverse.transport import cell_means
-from caustic_cli.optics.beam import slopes_inside
 from caustic_cli.optics.emission.measured import irradiance
-from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.interface import reflectance, slopes_inside
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
 from caustic_cli.scene import Aperture, CircularAperture, Scene

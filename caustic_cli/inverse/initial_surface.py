@@ -35,6 +35,8 @@ from caustic_cli.scene.elements import SIDES
 #: Most cells for which transport is solved.  Where more are needed, as for creases, it is solved on about COARSE, and the map is
 #: evaluated on finer cells.
 SOLVED, COARSE = 1024, 512
+#: See `extended`.
+BESIDE = 0.005
 #: Cells along the lens on which the shadow of its sides is found in tilted light.
 ROUGH = 128
 #: Sites per bright pixel where the map is evaluated on finer cells; fraction of the cells then needed that is accepted if it
@@ -340,12 +342,14 @@ def _best(grid: _Grid, middle: float, fixed: bool) -> _TruncatedSurface:
 
 
 def extended(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Surface:
-    """The cubic spline through heights z (k, l) at x (k,), y (l,), mm; linear beyond its edges."""
+    """The cubic spline through heights z (k, l) at x (k,), y (l,), mm; beyond its edges, where it is dark, the slope decays within
+    BESIDE of its width: continued, a crease would become a cliff."""
     spline = RectBivariateSpline(x, y, z)
 
     def heights(*places: np.ndarray) -> np.ndarray:
         within = [np.clip(at, c[0], c[-1]) for at, c in zip(places, (x, y), strict=True)]
-        beside = [at - inner for at, inner in zip(places, within, strict=True)]
+        lengths = [BESIDE * (c[-1] - c[0]) for c in (x, y)]
+        beside = [n * np.tanh((at - inner) / n) for at, inner, n in zip(places, within, lengths, strict=True)]
         found = spline(*within)
         if any(b.any() for b in beside):
             found = found + spline(*within, dx=1) * beside[0][:, None] + spline(*within, dy=1) * beside[1]

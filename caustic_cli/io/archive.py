@@ -33,7 +33,8 @@ from caustic_cli.schema.table import check
 
 #: Keys of a source and of its spectrum.
 KEYS = (
-    *("cone_half_angle", "source_type", "source_positions", "source_power", "source_profile", "source_size", "source_angle"),
+    *("cone_half_angle", "source_type", "source_positions", "source_power", "source_profile", "source_size"),
+    *("source_angle", "source_tilt"),
     *("source_intensity", "source_intensity_table", "source_brightness", "source_rays_sha256"),
     *("source_wavelengths", "source_weights", "source_spectrum", "source_detector", "source_efficacy"),
 )
@@ -219,7 +220,8 @@ def _measured(data: Archive, rays: RaySet | None) -> Measured:
 
 
 def _plane(data: Archive) -> PlaneWave:
-    return PlaneWave(_power(data), _picture(data, "source_profile"))
+    a, b = data.reals("source_tilt", 2).tolist() if "source_tilt" in data else (0.0, 0.0)
+    return PlaneWave(_power(data), _picture(data, "source_profile"), (a, b))
 
 
 def _points(data: Archive) -> Points:

@@ -20,19 +20,22 @@ entrance and does not reach the exit is lost through the sides of the lens.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.backends import Fused
+from caustic_cli.optics.interface import reflectance, slopes_inside
+from caustic_cli.optics.pencil import Bundle
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Aperture
 
 
 @dataclass(frozen=True, eq=False)
-class Beam:
+class Beam(Bundle):
     """Some parallel rays through points of the aperture of the last surface.
 
     sample: the points and the area of the aperture, mm^2, that each stands for, scalar or of their shape; aperture: of entrance and
@@ -52,19 +55,13 @@ class Beam:
     #: See `at_pupil`.
     rays_at_pupil: RayState
 
-    @property
-    def count(self) -> int:
-        """Number of rays."""
-        return self.sample.count
-
     def at_pupil(self) -> RayState:
-        """As many rays through the entrance's aperture."""
+        """As of a `Bundle`."""
         return self.rays_at_pupil
 
-    @property
-    def device(self) -> torch.device:
-        """Where its points are."""
-        return self.sample.device
+    def maker(self, backend) -> Callable[..., Fused | None]:
+        """As of a `Bundle`."""
+        return backend.beam_image
 
     def points(self) -> tuple[Tensor, Tensor]:
         """x (a, 1) and y (1, b) of a tensor product of points of the exit, or (N,) each, mm."""
@@ -91,10 +88,3 @@ class Beam:
         power = self.sample.flux * self.irradiance * self.transmittance(n, fresnel) * torch.where(lit, along, 0.0)
         direction = tuple(torch.full_like(power, c * over) for c in (kx, ky, 1.0))
         return direction, power
-
-
-def slopes_inside(direction: tuple[float, float, float], n: float) -> tuple[float, float]:
-    """Slopes k_x, k_y to z of light along a unit vector, behind a flat entrance into n times the index."""
-    x, y, _ = direction
-    along = math.sqrt((n - 1.0) * (n + 1.0) + direction[2] ** 2)
-    return x / along, y / along

@@ -14,6 +14,7 @@ Light from above the surface (side -1) is treated as light from below at the sur
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -149,3 +150,10 @@ def reflectance(kind: str, c, s, eta: float | Tensor):
         return r0 + (1.0 - r0) * (x2 * x2 * x)
     rs, rp = reflectances(c, s, eta)
     return 0.5 * (rs + rp)
+
+
+def slopes_inside(direction: tuple[float, float, float], n: float) -> tuple[float, float]:
+    """Slopes k_x, k_y to z of light along a unit vector, behind a flat entrance into n times the index."""
+    x, y, _ = direction
+    along = math.sqrt((n - 1.0) * (n + 1.0) + direction[2] ** 2)
+    return x / along, y / along

@@ -9,9 +9,8 @@ from __future__ import annotations
 from typing import TypeGuard
 
 from caustic_cli.optics.backends import Fused
-from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.frames import Pose
-from caustic_cli.optics.pencil import Pencil
+from caustic_cli.optics.pencil import Bundle
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import HeightField, Plane
 from caustic_cli.optics.system import Element, PlacedScreen
@@ -21,7 +20,7 @@ from caustic_cli.scene import Pupil, Screen
 def lowered(tracer, previous: Fused | None) -> Fused | None:
     """The rest of a tracer's system as one fused kernel; None where it does not apply.  previous: that of the previous chunk, whose
     prepared arrays are reused."""
-    if isinstance(tracer.rays, Pencil | Beam) and (fused := _pencil(tracer, tracer.rays, previous)) is not None:
+    if isinstance(tracer.rays, Bundle) and (fused := _pencil(tracer, tracer.rays, previous)) is not None:
         return fused
     system, start, (inside, outside) = tracer.system, tracer.start, tracer.media[-2:]
     element = system.elements[-1]
@@ -39,7 +38,7 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
     return tracer.backend.plane_image(element.surface, start, eta, element.fresnel, previous)
 
 
-def _pencil(tracer, pencil: Pencil | Beam, previous: Fused | None) -> Fused | None:
+def _pencil(tracer, pencil: Bundle, previous: Fused | None) -> Fused | None:
     """All of a tracer's system as one kernel for the rays of a source point, or of one at infinity: a flat entrance in front of the
     last surface."""
     system = tracer.system
@@ -52,8 +51,9 @@ def _pencil(tracer, pencil: Pencil | Beam, previous: Fused | None) -> Fused | No
     before, inside, outside = (medium.index_at(tracer.wavelength) for medium in tracer.media)
     if inside <= before or (exit.fresnel == "schlick" and inside < outside):
         return None
-    image = tracer.backend.beam_image if isinstance(pencil, Beam) else tracer.backend.pencil_image
-    return image(exit.surface, pencil, (inside / before, entrance.fresnel), inside / outside, exit.fresnel, previous)
+    return pencil.maker(tracer.backend)(
+        exit.surface, pencil, (inside / before, entrance.fresnel), inside / outside, exit.fresnel, previous
+    )
 
 
 def _needs_stages(tracer) -> bool:

@@ -38,6 +38,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.backends import Fused
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
@@ -48,8 +49,33 @@ DEGREES, ERROR, POINTS = (4, 8, 12, 16, 24), 1e-11, 257
 STEPS = 60
 
 
+class Bundle:
+    """Some rays through points of the aperture of the last surface, of which a kernel makes an image from the source on."""
+
+    #: The points, and the area of the aperture, mm^2, that each stands for.
+    sample: Sample
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        return self.sample.count
+
+    @property
+    def device(self) -> torch.device:
+        """Where its points are."""
+        return self.sample.device
+
+    def at_pupil(self) -> RayState:
+        """As many rays through the entrance's aperture."""
+        raise NotImplementedError
+
+    def maker(self, backend) -> Callable[..., Fused | None]:
+        """What makes the fused kernel of a backend for such rays."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, eq=False)
-class Pencil:
+class Pencil(Bundle):
     """Some rays of one source point, through the points of a tensor product on the aperture of the last surface.
 
     sample: its points and the area of the aperture, mm^2, that each stands for, scalar or (a, b); half_size: of the aperture, mm.
@@ -64,18 +90,16 @@ class Pencil:
     intensity: Callable[[Tensor], Tensor | float]
     #: Power that the source emits for these rays.
     emitted: float
-    #: As many rays through the entrance's aperture.
-    at_pupil: Callable[[], RayState]
+    #: See `at_pupil`.
+    rays_at_pupil: Callable[[], RayState]
 
-    @property
-    def count(self) -> int:
-        """Number of rays."""
-        return self.sample.count
+    def at_pupil(self) -> RayState:
+        """As of a `Bundle`."""
+        return self.rays_at_pupil()
 
-    @property
-    def device(self) -> torch.device:
-        """Where its points are."""
-        return self.sample.device
+    def maker(self, backend) -> Callable[..., Fused | None]:
+        """As of a `Bundle`."""
+        return backend.pencil_image
 
     @property
     def distance(self) -> float:

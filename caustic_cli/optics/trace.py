@@ -31,7 +31,6 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import Fused, backend_for, in_forward_mode, usable
-from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Emission, Rays, of_member, rays_of
 from caustic_cli.optics.frames import rotate_to_global, rotate_to_local
@@ -40,7 +39,7 @@ from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.interface import OutgoingRays, interact
 from caustic_cli.optics.lowering import covers, lowered
 from caustic_cli.optics.memory import with_smaller_chunks
-from caustic_cli.optics.pencil import Pencil
+from caustic_cli.optics.pencil import Bundle
 from caustic_cli.optics.ray_transfer import prepared_intersection
 from caustic_cli.optics.rays import LOSSES, RayState, RayStatus
 from caustic_cli.optics.receiver import Receiver
@@ -91,7 +90,7 @@ class Tracer:
     def __init__(
         self,
         system: System,
-        rays: Sample | RayState | Pencil | Beam,
+        rays: Sample | RayState | Bundle,
         dtype: torch.dtype = torch.float64,
         requests: Requests = NO_REQUESTS,
         like: Tracer | None = None,
@@ -148,7 +147,7 @@ class Tracer:
     def emitted(self) -> RayState:
         """The rays in front of the first element."""
         rays, pupil = self.rays, self.system.pupil
-        state = rays.at_pupil() if isinstance(rays, Pencil | Beam) else rays
+        state = rays.at_pupil() if isinstance(rays, Bundle) else rays
         return state if isinstance(state, RayState) else RayState.on_axis(state, pupil.half_size, pupil.z)
 
     @property
@@ -371,7 +370,7 @@ def is_by_rows(scene: Scene, field: HeightField, rays: Rays) -> bool:
     first = next(tracers(scene, field, rays, torch.float64, FEW), None)
     if first is None or first.fused is None:
         return False
-    return first.rays.sample.tensor if isinstance(first.rays, Pencil | Beam) and first.lit is not None else first.start.along_axis
+    return first.rays.sample.tensor if isinstance(first.rays, Bundle) and first.lit is not None else first.start.along_axis
 
 
 def evaluates_by_rows(scene: Scene) -> bool:
@@ -410,7 +409,7 @@ def tracers(
             yield traced
 
 
-def _chunks(sampler: Rays, size: int, share: tuple[int, int]) -> Iterator[Sample | RayState | Pencil | Beam]:
+def _chunks(sampler: Rays, size: int, share: tuple[int, int]) -> Iterator[Sample | RayState | Bundle]:
     """The rays of a sampler, as pencils where they are."""
     if isinstance(sampler, Emission) and sampler.homocentric:
         return sampler.pencils(size, *share)

@@ -17,19 +17,12 @@ from caustic_cli.errors import InputError
 if TYPE_CHECKING:
     from caustic_cli.scene import Scene
 
-#: Cosine between a screen's normal and the light from which on it counts as square to it.
-SQUARE = 1.0 - 1e-9
 #: Types of sources that other programs are known to have, or files of rays.
 KNOWN_SOURCES = ("plane", "point", "grid", "disc", "rays", "several")
 
 
 def _disc(scene: Scene) -> bool:
     return scene.source.kind == "disc"
-
-
-def _oblique(scene: Scene) -> bool:
-    (x, y, z), normal = scene.source.axis if scene.source.distant else (0.0, 0.0, 1.0), scene.screen.axes[2]
-    return abs(x * normal[0] + y * normal[1] + scene.lens.interaction.side * z * normal[2]) < SQUARE
 
 
 def _points(scene: Scene) -> bool:
@@ -68,7 +61,6 @@ TRAITS: Mapping[str, Trait] = {
     "coloured picture": Trait("a coloured picture", lambda s: s.colored, ("target.color",)),
     "lumens": Trait("power in lumens", lambda s: s.light.unit != "W", ("source.power_unit",)),
     "tilted screen": Trait("a tilted screen", lambda s: any(s.screen.tilt), ("screen.tilt",)),
-    "oblique screen": Trait("a screen that is not square to the light", _oblique),
     "shifted screen": Trait("a shifted screen", lambda s: any(s.screen.shift), ("screen.shift",)),
     "curved screen": Trait("a curved screen", lambda s: s.screen.curved, ("screen.radius", "screen.shape_file")),
     "several sources": Trait("several sources", lambda s: len(s.source.members) > 1, ("source.also",)),

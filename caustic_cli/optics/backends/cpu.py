@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,7 +15,6 @@ from torch import Tensor
 
 from caustic_cli.optics import intersection
 from caustic_cli.optics.backends.reference import Torch
-from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.gradient.fields import LEAST_SQUARE, SplineIndex
 from caustic_cli.optics.gradient.integrator import WEIGHTS, Flow
 from caustic_cli.optics.interface import OutgoingRays
@@ -35,6 +35,9 @@ from caustic_cli.optics.reintersection import HALVINGS, MOST_STEPS
 from caustic_cli.optics.sampling import Sample, key, salt
 from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.scene import Screen
+
+if TYPE_CHECKING:
+    from caustic_cli.optics.beam import Beam
 
 
 class Numba(Torch):

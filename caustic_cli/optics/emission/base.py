@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.beam import Beam
-from caustic_cli.optics.pencil import Pencil
+from caustic_cli.optics.pencil import Bundle
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import SAMPLERS, TENSOR, numbers
 from caustic_cli.scene import Pupil, Source
@@ -89,7 +88,7 @@ class Emission:
         """Whether its rays can be had as `pencils`."""
         return False
 
-    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Pencil | Beam]:
+    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
         """The rays in `chunks` of whole rows, as pencils, or as beams where their vertex is at infinity."""
         raise NotImplementedError
 

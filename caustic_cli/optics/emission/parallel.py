@@ -1,13 +1,25 @@
-"""Sampling of a plane wave: points of the aperture, since a plane entrance does not deviate normally incident rays."""
+"""Sampling of a plane wave: points of the aperture, since a plane entrance does not deviate normally incident rays; or one
+direction through these points for a wave that is tilted to the axis.
+
+The power of a plane wave is that through the aperture: of a tilted one, of the cross section that the tilted aperture cuts out.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from caustic_cli.optics.emission.base import Illuminated
-from caustic_cli.optics.sampling import Sampler
+from caustic_cli.loading import OnDemand
+from caustic_cli.optics.emission.base import Emission, Illuminated
+from caustic_cli.optics.pencil import Bundle
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.sampling import Sample, Sampler
 from caustic_cli.scene import Aperture
+
+beam = OnDemand("caustic_cli.optics.beam")
 
 #: Points along each axis for the mean of a profile over a round aperture.
 ROUND = 1000
@@ -31,4 +43,59 @@ def mean_irradiance(profile: np.ndarray, aperture: Aperture) -> float:
     return float(profile[i[:, None], j[None, :]][inside].mean())
 
 
-EMISSIONS = {"plane": parallel}
+@dataclass(frozen=True, eq=False)
+class TiltedPlane(Emission):
+    """Parallel rays at an angle to z, through points of the aperture."""
+
+    @classmethod
+    def of_size(cls, scene: Illuminated, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> TiltedPlane:
+        """As of an `Emission`."""
+        return cls(scene, kind, parallel(scene, kind, rays, seed, device).shape, seed, device)
+
+    def _samples(self, size: int, first: int, step: int) -> Iterator[Sample]:
+        """The points of the aperture, as of a plane wave along z."""
+        whole = parallel(self.scene, self.kind, self.count, self.seed, self.device)
+        return replace(whole, shape=self.shape).chunks(size, first, step)
+
+    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
+        """As of an `Emission`."""
+        for sample in self._samples(size, first, step):
+            yield self._at(sample)
+
+    @property
+    def homocentric(self) -> bool:
+        """Whether its rays can be had as `pencils`, with their vertex at infinity: where a profile does not weight them."""
+        return self.scene.source.profile is None
+
+    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
+        """The rays in `chunks`, as beams: through as many points of the exit."""
+        pupil = self.scene.pupil
+        cell = 4.0 * pupil.half_size[0] * pupil.half_size[1] / self.count
+        whole = Sampler(self.kind, self.shape, self.seed, device=self.device)
+        for at_pupil, sample in zip(self._samples(size, first, step), whole.chunks(size, first, step), strict=True):
+            inside = torch.tensor(cell, dtype=torch.float64)
+            if pupil.aperture.round:
+                u, v = (sample.u[:, None], sample.v[None, :]) if sample.tensor else (sample.u, sample.v)
+                inside = cell * pupil.aperture.covers(2.0 * u - 1.0, 2.0 * v - 1.0).double()
+            state = self._at(at_pupil)
+            yield beam.Beam(
+                replace(sample, flux=inside),
+                pupil.aperture,
+                self.scene.source.axis,
+                pupil.z,
+                1.0 / pupil.aperture.area,
+                float(state.power.sum()),
+                state,
+            )
+
+    def _at(self, sample: Sample) -> RayState:
+        """Rays through points of the aperture."""
+        shape, half = sample.shape, self.scene.pupil.half_size
+        u, v = (sample.u[:, None], sample.v[None, :]) if sample.tensor else (sample.u, sample.v)
+        x, y = (((2.0 * c - 1.0) * r).expand(shape).reshape(-1) for c, r in zip((u, v), half, strict=True))
+        power = sample.flux.expand(shape).reshape(-1)
+        dx, dy, dz = (torch.full_like(x, c) for c in self.scene.source.axis)
+        return self._at_pupil(x, y, (dx, dy, dz), power, float(power.sum()))
+
+
+EMISSIONS = {"plane": parallel, "tilted plane": TiltedPlane.of_size}

@@ -7,13 +7,13 @@ refracts, transfers to the screen and splats.  Everything is float64, whatever t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks, fused, pixels, random_points
 from caustic_cli.optics.kernels.arguments import (
@@ -35,6 +35,9 @@ from caustic_cli.optics.kernels.threads import ALL
 from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
+
+if TYPE_CHECKING:
+    from caustic_cli.optics.beam import Beam
 
 #: A source point, or parallel light at an angle to z; neither for other rays.
 Light = tuple[Point | None, ParallelLight | None]

@@ -46,7 +46,9 @@ WAVES_BY_DEFAULT = Capability(
         "curved screen": WAVE_IMAGE.unsupported["curved screen"],
         "lenslet array": "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on"
         " refines it",
-        "oblique screen": "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same",
+        "tilted screen": "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same",
+        "tilted light": "in tilted light it holds for surfaces that are smooth over the Fresnel scale of their depth along the"
+        " light; ⟨waves⟩ on refines it all the same",
     },
 )
 #: Of the scenes without a wave image, the limits of what is implemented, so that the effect cannot be asked for.
