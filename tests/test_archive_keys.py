@@ -35,7 +35,8 @@ PLAIN = Scene(PlaneWave(), LENS, SCREEN)
 #: Together they have every key.
 SCENES = {
     "plain": PLAIN,
-    "profile": replace(PLAIN, source=PlaneWave(profile=np.ones((3, 4)), tilt=(20.0, 0.0)), light=Light(polarisation=30.0, unit="lm")),
+    "profile": replace(PLAIN, source=PlaneWave(profile=np.ones((3, 4))), light=Light(polarisation=30.0, unit="lm")),
+    "tilted": replace(PLAIN, source=PlaneWave(tilt=(20.0, 0.0))),
     "sun": replace(PLAIN, source=Disc(angle=0.5, brightness=np.ones((3, 5)))),
     "grid": replace(PLAIN, source=Points(((0.0, 0.0, -30.0), (1.0, 0.0, -30.0)), kind="grid", intensity=TABLE)),
     "disc": replace(PLAIN, source=Disc(), light=Light(wavelengths=(500.0, 600.0), measure=LED, efficacy=300.0)),

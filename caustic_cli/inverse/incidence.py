@@ -150,7 +150,8 @@ def _tilted(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     kx, ky = slopes_inside(scene.source.axis, lens.inside)
     depth = z - lens.z_in
     crossed = [cell_means(c + 0.0 * depth) for c in (x[:, None] - kx * depth, y[None, :] - ky * depth)]
-    light = np.ones(crossed[0].shape)
+    slopes = np.gradient(z, x, y)
+    light = cell_means(1.0 - kx * slopes[0] - ky * slopes[1])  # D . N, see `optics.beam`
     for inside, step in zip(lens.opening.edges(*crossed, lens.half_size), (x[1] - x[0], y[1] - y[0]), strict=True):
         light *= 1.0 if inside is None else np.clip(inside / step + 0.5, 0.0, 1.0)  # the lit part of a cell at the edge
     if profile is not None:

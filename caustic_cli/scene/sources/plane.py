@@ -58,7 +58,7 @@ class PlaneWave(Source):
         return "a plane wave has one direction"
 
 
-#: Largest angle of light to +z, degrees: beyond it a flat face reflects more than half of it, and the beam is a fifth as wide.
+#: Largest angle of light to +z, degrees: beyond it glass of index 1.5 reflects more than a third, and the beam is a sixth as wide.
 GRAZING = 80.0
 
 
