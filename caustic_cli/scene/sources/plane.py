@@ -11,7 +11,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.scene.screen import tilted
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.section import SourceType, Table
-from caustic_cli.schema.table import check
+from caustic_cli.schema.table import check, default
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def check_tilt(tilt: tuple[float, float]) -> None:
 
 
 def _plane(table: Table, profile: np.ndarray | None) -> PlaneWave:
-    return PlaneWave(table["power"], profile, tuple(table["tilt"]))
+    return PlaneWave(table["power"], profile, tuple(table.get("tilt") or default("source.tilt")))
 
 
 TYPES = (SourceType("plane", "plane (as wide as the lens)", ("profile", "tilt"), _plane),)
