@@ -28,7 +28,7 @@ from caustic_cli.export.surface import Sampling, control_points, sample_grid, sa
 from caustic_cli.io.files import MARK, atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.scene import Aperture, Lens, Light, PlaneWave, Scene, Screen, Source
+from caustic_cli.scene import Aperture, Lens, Light, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 
 FORMAT_VERSION = 1
@@ -282,7 +282,6 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
 
 def _of_plane(scene: Scene) -> dict[str, np.ndarray]:
     wave = scene.source
-    assert isinstance(wave, PlaneWave)
     tilt = {"source_tilt": _reals(wave.tilt)} if any(wave.tilt) else {}
     return {"cone_half_angle": _reals(0.0)} | ({} if wave.profile is None else {"source_profile": _reals(wave.profile)}) | tilt
 

@@ -33,7 +33,7 @@ from caustic_cli.optics.memory import smaller_chunk
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
-from caustic_cli.optics.trace import Parameters, Tracer, is_by_rows, is_lowered, tracers
+from caustic_cli.optics.trace import Parameters, Tracer, is_by_rows, tracers
 from caustic_cli.scene import Scene, Screen
 
 if TYPE_CHECKING:
@@ -222,7 +222,7 @@ class Objective:
         """Whether the rays are a tensor grid on the exit, for which there is a fused kernel."""
         if not all(isinstance(s, (Sampler, Emission)) and s.tensor for s in self.samplers):
             return False
-        return is_lowered(self.scene, self.field) and all(is_by_rows(self.scene, self.field, s) for s in self.samplers)
+        return all(is_by_rows(self.scene, self.field, s, self.scene.screen) for s in self.samplers)
 
     def _tracers(self) -> Iterator[tuple[int, Tracer]]:
         """Tracers of the chunks of this rank, each with the index of its source point."""

@@ -365,10 +365,11 @@ def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUEST
     return covers(scene.screen, few.fused)
 
 
-def is_by_rows(scene: Scene, field: HeightField, rays: Rays) -> bool:
-    """Whether rays are traced by a fused kernel that evaluates the surface at a tensor product of its points."""
+def is_by_rows(scene: Scene, field: HeightField, rays: Rays, onto: Screen | None = None) -> bool:
+    """Whether rays are traced by a fused kernel that evaluates the surface at a tensor product of its points; onto: and splats onto
+    this screen."""
     first = next(tracers(scene, field, rays, torch.float64, FEW), None)
-    if first is None or first.fused is None:
+    if first is None or first.fused is None or (onto is not None and not covers(onto, first.fused)):
         return False
     return first.rays.sample.tensor if isinstance(first.rays, Bundle) and first.lit is not None else first.start.along_axis
 

@@ -79,9 +79,9 @@ PAGE = Capability(
         "gradient index": "⟨html⟩: the page traces lenses of one index, and this one's varies",
         "other elements": "⟨html⟩: the page traces a single lens, and this scene has [[element]] tables",
         "two sides": "⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form",
-        "tilted light": "⟨html⟩: the page traces plane waves along the axis, not tilted ones",
         "ray file": FILE,
         "ray file among sources": FILE,
+        "tilted light": "⟨html⟩: the page traces plane waves along the axis, not tilted ones",
     },
 )
 

@@ -40,6 +40,8 @@ def power_on_tilted(r: Receiver, s: Sampling, front: Wavefront, length: float, b
     plane = r.plane
     e1, e2, e3 = plane.axes
     device = front.path.device
+    if not bool((front.density > 0).any()):  # no light lands near the screen
+        return torch.zeros(r.resolution, dtype=torch.float64, device=device)
     u, v = (
         r.low[k] + r.pixel[k] * (torch.arange(A_PIXEL * r.resolution[k], dtype=torch.float64, device=device) + 0.5) / A_PIXEL
         for k in (0, 1)

@@ -33,17 +33,18 @@ class Source:
     """A light source: plain data, validated on construction.  Lengths in mm, powers in W, angles in rad unless stated otherwise.
 
     kind: name of its type in [source] type; power: emitted into the cone, or through the aperture for a distant source; profile:
-    relative irradiance over the aperture, (a, b), or None if uniform; cone: half-angle of the emission cone as given, degrees, or
-    None for the narrowest that covers the lens; intensity: uniform in solid angle, lambertian, or tabulated; aimed: rays are
-    sampled over the lens instead of over the whole cone; axis: a unit vector, the direction of light from infinity, or the axis of
-    the cone of a near source and of its intensity, +z except where errors of alignment tilt it; collimated: see the module; rays:
-    ray set of a file, None for a source that is sampled;
+    relative irradiance over the aperture, (a, b), or None if uniform; tilt: of the axis of light from infinity, degrees, see
+    `PlaneWave`; cone: half-angle of the emission cone as given, degrees, or None for the narrowest that covers the lens; intensity:
+    uniform in solid angle, lambertian, or tabulated; aimed: rays are sampled over the lens instead of over the whole cone; axis: a
+    unit vector, the direction of light from infinity, or the axis of the cone of a near source and of its intensity, +z except
+    where errors of alignment tilt it; collimated: see the module; rays: ray set of a file, None for a source that is sampled;
     brightness: relative radiance over `frame`, (a, b) [i, j], or None if uniform over an ellipse; spectra: of several sources,
     wavelengths, nm, and relative powers of each; measures: and the continuous spectrum that these are samples of, or None.
     """
 
     kind: str
     profile: np.ndarray | None = None
+    tilt: tuple[float, float] = (0.0, 0.0)
     cone: float | None = None
     intensity: str | Distribution = "uniform"
     aimed: bool = True
