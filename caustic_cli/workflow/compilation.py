@@ -124,7 +124,7 @@ def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = Fal
     Net and image are small, and a plane wave or a point represents the source.  gradient: compile the adjoints, too.
     """
     lens = replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None, array=(1, 1))
-    source = scene.source if scene.source.parallel else Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
+    source = PlaneWave(tilt=scene.source.tilt) if scene.source.parallel else Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
     scene, field = Scene(source, lens, scene.screen, Light(scene.light.polarisation)), HeightField.of(lens)
     heights = torch.full((4, 4), lens.offset.thickness, dtype=torch.float64, requires_grad=gradient)
     screen = replace(scene.screen, resolution=(4, 4))
