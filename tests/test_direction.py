@@ -185,6 +185,7 @@ def test_design_and_render(in_tmp, capfd):
         (("--source-tilt", "70,60"), "within 80 degrees"),
         (("--source-tilt", "20,0", "--mirror"), "one lens with a flat entrance"),
         (("--source-tilt", "20,0", "--array", "2"), "one lens with a flat entrance"),
+        (("--source-tilt", "20,0", "--robust", "t.toml"), "--robust"),
         (("--source-tilt", "20,0", "--source", "point"), "tilt"),
         (("--source-tilt", "75,0", "--thickness", "30"), "sides"),
         (("--source-tilt", "nan,0"), "tilt"),
@@ -192,6 +193,7 @@ def test_design_and_render(in_tmp, capfd):
 )
 def test_nonsense_is_refused_in_a_line(in_tmp, capfd, options, words):
     write_blob()
+    (in_tmp / "t.toml").write_text("[source_tilt]\nsigma = [0.1, 0.1]\n")
     assert design(*options) == 2
     error = capfd.readouterr().err
     assert words in error.splitlines()[-1] and "Traceback" not in error

@@ -66,6 +66,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
             (*TRAITS["two sides"].settings, "lens.mirror", "lens.gradient", "lens.array", "element", "source.also", "design.over"),
             "⟨source.tilt⟩ is for one lens with a flat entrance and one source, without ⟨{path}⟩",
         ),
+        "design.robust": "⟨source.tilt⟩ cannot be combined with ⟨design.robust⟩, whose errors are those of light along the axis",
     },
     "design.over": {"design.robust": "⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already"},
 }

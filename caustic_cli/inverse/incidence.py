@@ -31,7 +31,7 @@ from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance, slopes_inside
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
-from caustic_cli.scene import Aperture, CircularAperture, Lens, Scene
+from caustic_cli.scene import Aperture, CircularAperture, Scene
 from caustic_cli.scene.sources.distribution import relative
 
 #: Newton iterations for q; the function is concave, so that they increase monotonically from the greater of two lower bounds.
@@ -151,8 +151,7 @@ def _tilted(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     depth = z - lens.z_in
     crossed = [cell_means(c + 0.0 * depth) for c in (x[:, None] - kx * depth, y[None, :] - ky * depth)]
     zx, zy = np.gradient(z, x, y)
-    along = 1.0 - kx * zx - ky * zy  # D . N, see `optics.beam`
-    light = cell_means(along * _transmittance(lens, along / np.sqrt((1.0 + kx * kx + ky * ky) * (1.0 + zx * zx + zy * zy))))
+    light = cell_means(1.0 - kx * zx - ky * zy)  # D . N, see `optics.beam`
     for inside, step in zip(lens.opening.edges(*crossed, lens.half_size), (x[1] - x[0], y[1] - y[0]), strict=True):
         light *= 1.0 if inside is None else np.clip(inside / step + 0.5, 0.0, 1.0)  # the lit part of a cell at the edge
     if profile is not None:
@@ -160,15 +159,6 @@ def _tilted(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
         light *= profile[tuple(np.clip(i, 0, n - 1) for i, n in zip(at, profile.shape, strict=True))]
     over = 1.0 / math.sqrt(1.0 + kx * kx + ky * ky)
     return light, tuple(np.full_like(z, c * over) for c in (kx, ky, 1.0))
-
-
-def _transmittance(lens: Lens, cosine: np.ndarray) -> np.ndarray | float:
-    """Of the exit, for rays at angles of these cosines to its normal; 0 where they are totally reflected."""
-    if lens.mirror or lens.fresnel == "none":
-        return 1.0
-    square = 1.0 - lens.inside**2 * (1.0 - cosine * cosine)
-    behind = np.sqrt(np.maximum(square, 0.0))
-    return np.where(square > 0, 1.0 - reflectance("exact", cosine, behind, lens.inside), 0.0)
 
 
 def lit_rectangle(
@@ -184,7 +174,7 @@ def lit_rectangle(
     """
     lens, source = scene.lens, scene.source
     low, high = [-r for r in lens.half_size], list(lens.half_size)
-    if not (source.distant and source.lean):
+    if not source.oblique:
         return (low[0], low[1]), (high[0], high[1])
     lines = [np.linspace(-r, r, EDGE) for r in lens.half_size]
     for axis, slope in enumerate(slopes_inside(source.axis, lens.inside)):
@@ -228,7 +218,7 @@ def _(aperture: CircularAperture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
     """`incident` over the whole rectangle, by the closed form above."""
     source, lens, shape = scene.source, scene.lens, (len(x) - 1, len(y) - 1)
-    if source.lean and source.distant:
+    if source.oblique:
         return _tilted(scene, x, y, z)
     if source.distant:
         profile = source.profile

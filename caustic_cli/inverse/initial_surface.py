@@ -171,7 +171,7 @@ class _Grid:
         if self.scene.behind:
             return RelayedScreen(self.scene, mean)
         source, side = self.scene.source, self.scene.lens.interaction.side
-        if source.distant and source.lean:
+        if source.oblique:
             return BeamProjection(screen, mean, side, source.axis)
         return None if screen.upright else ScreenProjection(screen, mean, side)
 
@@ -272,7 +272,7 @@ def first_surface(
         options = {"tolerance": EXACT, "most": STEPS}
     grid, lens = _Grid.of(scene, target, cells // times), scene.lens
     z = grid.offset
-    if scene.source.distant and scene.source.lean:  # the shadow of the lens' sides depends on the heights
+    if scene.source.oblique:  # the shadow of the lens' sides depends on the heights
         rough = _Grid.of(scene, target, ROUGH)
         surface = extended(*rough.places, rough.solved(*rough.incident(rough.offset), float(rough.offset.mean())).heights)
         grid = _Grid.of(scene, target, cells // times, surface)
@@ -359,7 +359,7 @@ def extended(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Surface:
 
 
 def net_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, field: HeightField) -> Tensor:
-    """Control heights (n, m) of the surface with these heights at corners x (k,), y (l,): z (k, l), mm; linear beyond them."""
+    """Control heights (n, m) of the surface with these heights at corners x (k,), y (l,): z (k, l), mm, `extended` beyond them."""
     values = torch.from_numpy(extended(x, y, z)(*(c.numpy() for c in field.control_xy())))
     net = field.interpolated(values)
     # An interpolating spline of high degree with repeated knots overshoots; the values as control net (Schoenberg) do not.

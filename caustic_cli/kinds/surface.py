@@ -244,7 +244,7 @@ class OneSurface(Problem):
         map is solved for, which shows as lines: a flame at 30 degrees has an error of 0.205 on the finer net and 0.087 without.  In
         light that is tilted to the axis the map is solved for the screen's own pixels.
         """
-        aligned = d.source.distant and (build_screen(d.s.screen).upright or d.source.lean > 0)
+        aligned = d.source.distant and (build_screen(d.s.screen).upright or d.source.oblique)
         creased = d.gaps >= GAPS and not (d.own_control or waves or cls.spread(d)) and aligned
         if creased:
             d.set_control([creased_control(max(d.resolution), p, d.effort.creased) for p in d.lens.degree])

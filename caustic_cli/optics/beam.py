@@ -27,8 +27,8 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.backends import Fused
-from caustic_cli.optics.interface import reflectance, slopes_inside
-from caustic_cli.optics.pencil import Bundle
+from caustic_cli.optics.interface import slopes_inside
+from caustic_cli.optics.pencil import Bundle, entrance_transmittance
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Aperture
@@ -53,11 +53,11 @@ class Beam(Bundle):
     #: Power of these rays.
     emitted: float
     #: See `at_pupil`.
-    rays_at_pupil: RayState
+    rays_at_pupil: Callable[[], RayState]
 
     def at_pupil(self) -> RayState:
         """As of a `Bundle`."""
-        return self.rays_at_pupil
+        return self.rays_at_pupil()
 
     def maker(self, backend) -> Callable[..., Fused | None]:
         """As of a `Bundle`."""
@@ -74,9 +74,7 @@ class Beam(Bundle):
 
     def transmittance(self, n: float, fresnel: str) -> float:
         """T."""
-        cosine = torch.tensor(self.direction[2], dtype=torch.float64)
-        behind = torch.sqrt(1.0 - (1.0 - cosine * cosine) / (n * n))
-        return float(1.0 - reflectance(fresnel, cosine, behind, 1.0 / n))
+        return float(entrance_transmittance(torch.tensor(1.0 / self.direction[2], dtype=torch.float64), n, fresnel))
 
     def rays(self, z: Tensor, slopes: tuple[Tensor, Tensor], n: float, fresnel: str) -> tuple[tuple, Tensor]:
         """Unit directions in front of the exit, and powers there, for its heights above the entrance, mm, and slopes, of the shape

@@ -119,12 +119,12 @@ class Pencil(Bundle):
         secant = torch.sqrt(1.0 + (x * x + y * y) / self.distance**2)
         power = self.intensity(secant) * self.sample.flux / (self.distance**2 * secant**3)
         power = power.expand(self.sample.shape) if isinstance(power, Tensor) else power
-        return power.sum(), (power * _transmittance(secant, n, fresnel)).sum()
+        return power.sum(), (power * entrance_transmittance(secant, n, fresnel)).sum()
 
     def emission(self, s: Tensor, n: float, fresnel: str) -> Tensor:
         """J, 1/sr, at s."""
         secant = 1.0 / torch.sqrt(1.0 - s)
-        return self.intensity(secant) * _transmittance(secant, n, fresnel) / secant**3
+        return self.intensity(secant) * entrance_transmittance(secant, n, fresnel) / secant**3
 
     def polynomial(self, n: float, fresnel: str) -> tuple[np.ndarray, float] | None:
         """J as a polynomial in 2 s / s_max - 1, the highest coefficient first, and s_max, the largest s at which the entrance is
@@ -167,7 +167,7 @@ class Pencil(Bundle):
         return (k * x * over, k * y * over, over), self.sample.flux * density * along.clamp_min(0.0)
 
 
-def _transmittance(secant: Tensor, n: float, fresnel: str) -> Tensor:
+def entrance_transmittance(secant: Tensor, n: float, fresnel: str) -> Tensor:
     """T at angles with this secant in front of the entrance."""
     cosine = 1.0 / secant
     behind = torch.sqrt(1.0 - (1.0 - cosine * cosine) / (n * n))

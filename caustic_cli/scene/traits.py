@@ -71,7 +71,7 @@ TRAITS: Mapping[str, Trait] = {
     ),
     "user-defined source": Trait("a user-defined type of source", lambda s: s.source.kind not in KNOWN_SOURCES),
     "near source": Trait("a source nearby", lambda s: not s.source.distant, ("source.position",)),
-    "tilted light": Trait("light that is tilted to the axis", lambda s: any(s.source.tilt), ("source.tilt",)),
+    "tilted light": Trait("light that is tilted to the axis", lambda s: s.source.oblique, ("source.tilt",)),
     "light not parallel": Trait("light that is not parallel", lambda s: not s.source.parallel),
     "separate places": Trait("sources in separate places", lambda s: s.source.apart),
     "uneven plane wave": Trait("a profile of its irradiance", lambda s: s.source.profile is not None, ("source.profile",)),

@@ -247,13 +247,7 @@ class PencilImage:
         """Image, power that leaves the surface, and what was lost since the source; what misses the surface is the rest."""
         reference = float(heights.detach().mean())
         image, leaving, lost = self.kernel(heights - reference, *self.interface, reference, screen, filter)
-        met = leaving.detach() + lost["fresnel"] + lost["total_internal_reflection"]
-        lost |= {
-            "missed_lens": self.emitted - self.entering,
-            "missed_surface": self.passed - met,
-            "fresnel": self.entering - self.passed + lost["fresnel"],
-        }
-        return image, leaving, lost
+        return image, leaving, _since_source(self, leaving, lost) | {"missed_lens": self.emitted - self.entering}
 
 
 class BeamImage:
@@ -275,9 +269,13 @@ class BeamImage:
         reference = float(heights.detach().mean())
         receiver = Receiver.on_axis(screen, (0.0, 0.0, 1.0))
         image, leaving, lost = self.kernel.onto(heights - reference, *self.interface, reference, receiver, filter)
-        met = leaving.detach() + lost["fresnel"] + lost["total_internal_reflection"]
-        lost |= {"missed_surface": self.passed - met, "fresnel": self.entering - self.passed + lost["fresnel"]}
-        return image, leaving, lost
+        return image, leaving, _since_source(self, leaving, lost)
+
+
+def _since_source(image: PencilImage | BeamImage, leaving: Tensor, lost: dict) -> dict:
+    """Losses from the pupil on, from those at the exit; what misses the exit is the rest of what passed the entrance."""
+    met = leaving.detach() + lost["fresnel"] + lost["total_internal_reflection"]
+    return lost | {"missed_surface": image.passed - met, "fresnel": image.entering - image.passed + lost["fresnel"]}
 
 
 class RayImage:

@@ -17,7 +17,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.pencil import Bundle
 from caustic_cli.optics.rays import RayState
-from caustic_cli.optics.sampling import SAMPLERS, TENSOR, numbers
+from caustic_cli.optics.sampling import SAMPLERS, TENSOR, Sample, numbers
 from caustic_cli.scene import Pupil, Source
 from caustic_cli.scene.sources.distribution import Distribution
 
@@ -91,6 +91,15 @@ class Emission:
     def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
         """The rays in `chunks` of whole rows, as pencils, or as beams where their vertex is at infinity."""
         raise NotImplementedError
+
+    def _areas(self, sample: Sample) -> Tensor:
+        """Area of the aperture, mm^2, for each point of a sample of its rectangle: a scalar, or of the sample's shape."""
+        (rx, ry), aperture = self.scene.pupil.half_size, self.scene.pupil.aperture
+        cell = 4.0 * rx * ry / (self.shape[0] * self.shape[1])
+        if not aperture.round:
+            return torch.tensor(cell, dtype=torch.float64)
+        u, v = (sample.u[:, None], sample.v[None, :]) if sample.tensor else (sample.u, sample.v)
+        return cell * aperture.covers(2.0 * u - 1.0, 2.0 * v - 1.0).double()
 
     def _drawn(self, start: int, *draws: Tensor) -> RayState:
         """Rays from number `start` on, from samples of the unit cube: `dimensions` tensors (N,)."""

@@ -70,17 +70,13 @@ class Near(Emission):
 
     def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Pencil]:
         source, pupil = self.scene.source, self.scene.pupil
-        (rx, ry), (nu, nv), aperture = pupil.half_size, self.shape, pupil.aperture
+        nv = self.shape[1]
         x, y, z = map(float, source.points()[0][0])
-        cell, start = 4.0 * rx * ry / (nu * nv), first * max(1, size // nv) * nv
+        start = first * max(1, size // nv) * nv
         for sample in Sampler(self.kind, self.shape, self.seed, device=self.device).chunks(size, first, step):
-            if aperture.round:
-                area = cell * aperture.covers(2.0 * sample.u[:, None] - 1.0, 2.0 * sample.v[None, :] - 1.0).double()
-            else:
-                area = torch.tensor(cell, dtype=torch.float64)
             yield Pencil(
-                replace(sample, flux=area),
-                (rx, ry),
+                replace(sample, flux=self._areas(sample)),
+                pupil.half_size,
                 (x, y, z),
                 pupil.z,
                 partial(intensity_of, source, source.cone_over(pupil)),

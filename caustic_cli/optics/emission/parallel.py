@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -69,24 +70,11 @@ class TiltedPlane(Emission):
 
     def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
         """The rays in `chunks`, as beams: through as many points of the exit."""
-        pupil = self.scene.pupil
-        cell = 4.0 * pupil.half_size[0] * pupil.half_size[1] / self.count
-        whole = Sampler(self.kind, self.shape, self.seed, device=self.device)
-        for at_pupil, sample in zip(self._samples(size, first, step), whole.chunks(size, first, step), strict=True):
-            inside = torch.tensor(cell, dtype=torch.float64)
-            if pupil.aperture.round:
-                u, v = (sample.u[:, None], sample.v[None, :]) if sample.tensor else (sample.u, sample.v)
-                inside = cell * pupil.aperture.covers(2.0 * u - 1.0, 2.0 * v - 1.0).double()
-            state = self._at(at_pupil)
-            yield beam.Beam(
-                replace(sample, flux=inside),
-                pupil.aperture,
-                self.scene.source.axis,
-                pupil.z,
-                1.0 / pupil.aperture.area,
-                float(state.power.sum()),
-                state,
-            )
+        pupil, axis = self.scene.pupil, self.scene.source.axis
+        for sample in self._samples(size, first, step):
+            emitted = float(sample.flux.expand(sample.shape).sum())
+            exit = replace(sample, flux=self._areas(sample))
+            yield beam.Beam(exit, pupil.aperture, axis, pupil.z, 1.0 / pupil.aperture.area, emitted, partial(self._at, sample))
 
     def _at(self, sample: Sample) -> RayState:
         """Rays through points of the aperture."""

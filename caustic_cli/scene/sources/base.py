@@ -94,6 +94,11 @@ class Source:
         return self.collimated or (len(self.members) == 1 and self.distant and self.half_angle == 0)
 
     @property
+    def oblique(self) -> bool:
+        """Whether it is at infinity, and not in the direction of z."""
+        return any(self.tilt)
+
+    @property
     def half_angle(self) -> float:
         """Largest angle of a distant source's rays to its axis."""
         return 0.0

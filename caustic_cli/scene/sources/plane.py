@@ -46,7 +46,7 @@ class PlaneWave(Source):
     @property
     def collimated(self) -> bool:
         """As of a source."""
-        return not any(self.tilt)
+        return not self.oblique
 
     @property
     def emission(self) -> str:
