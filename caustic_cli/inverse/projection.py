@@ -138,7 +138,7 @@ class BeamProjection(ScreenProjection):
     def gain(self, index: float) -> float:
         """As of a `ScreenProjection`."""
         c = self.beam[2]
-        return self.distance * (-2.0 * c if index < 0 else math.sqrt((index - 1.0) * (index + 1.0) + c * c) - c)
+        return self.distance * (2.0 * c if index < 0 else math.sqrt((index - 1.0) * (index + 1.0) + c * c) - c)
 
     @cached_property
     def _linear(self) -> tuple[np.ndarray, np.ndarray]:

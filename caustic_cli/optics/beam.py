@@ -42,6 +42,8 @@ class Beam(Bundle):
     exit.
     """
 
+    reflects = True
+
     sample: Sample
     aperture: Aperture
     #: d.

@@ -69,7 +69,7 @@ def complete(
         s = s.changed(source=at, design=complete_network(s.design))
     if over or relative_to_initial(s.design):
         s = s.changed(design=s.design if "initial" in given.get("design", {}) else s.design.changed(initial="zero-last"))
-    s = s.changed(screen=facing(s), second=complete_second(s))
+    s = s.changed(second=complete_second(s))
     s = s.changed(target=complete_target(s, by, aspect))
     s = s.changed(screen=complete_screen(s.screen, s.target, by))
     s = s.changed(second=complete_second_size(s))
@@ -77,6 +77,7 @@ def complete(
     build_screen(s.screen)
     source = build_source(s.source)
     s = s.changed(lens=complete_lens(s, source))
+    s = s.changed(screen=facing(s))
     return complete_design(Defaults(s, source, by.quality, by.rays, lit, gaps))
 
 
@@ -138,13 +139,14 @@ def complete_source(
 
 
 def facing(s: Settings) -> ScreenSettings:
-    """The screen, square to light that is tilted and centred on it, where its own tilt and shift are not given."""
+    """The screen, square to light that is tilted, passed on or reflected, and centred on it, where its own tilt and shift are not
+    given."""
     tilt = s.source.tilt
     if tilt is None or not any(tilt):
         return s.screen
-    side, (dx, dy, dz) = interaction_of(s.lens.mirror).side, build_source(s.source).axis
-    reach = abs(s.screen.z) / dz
-    return s.screen.filled(tilt=[side * angle for angle in tilt], shift=[reach * dx, reach * dy])
+    interaction, (dx, dy, dz) = interaction_of(s.lens.mirror), build_source(s.source).axis
+    reach = abs(s.screen.z - interaction.front(s.lens.z_in, s.lens.thickness)) / dz
+    return s.screen.filled(tilt=[interaction.side * angle + 0.0 for angle in tilt], shift=[reach * dx, reach * dy])
 
 
 def complete_target(s: Settings, by: Parameters, aspect: float) -> TargetSettings:

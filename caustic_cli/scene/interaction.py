@@ -55,6 +55,10 @@ class Refracting:
         """z that the surface must not fall below, mm: of the flat face where light enters."""
         return z_in
 
+    def front(self, z_in: float, vertex: float) -> float:
+        """z of the aperture that a source illuminates, mm: of the entrance, or of the vertex of the surface."""
+        return z_in
+
     def entered(self, z_in: float, z: np.ndarray) -> np.ndarray:
         """z at which light enters the body on its way to points of the surface at z, mm."""
         return np.full(z.shape, z_in)
@@ -131,6 +135,10 @@ class Reflecting(Refracting):
     def base(self, z_in: float) -> float:
         """None."""
         return -math.inf
+
+    def front(self, z_in: float, vertex: float) -> float:
+        """Of the vertex."""
+        return vertex
 
     def entered(self, z_in: float, z: np.ndarray) -> np.ndarray:
         """At the surface itself."""

@@ -212,8 +212,8 @@ class Lens:
 
     @property
     def pupil(self) -> Pupil:
-        """Its aperture at the entrance."""
-        return Pupil(self.opening, self.z_in)
+        """Its aperture where light meets it first: at the entrance, or at the vertex of a mirror."""
+        return Pupil(self.opening, self.interaction.front(self.z_in, self.offset.thickness))
 
     @property
     def lowest(self) -> float:

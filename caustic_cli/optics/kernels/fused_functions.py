@@ -126,16 +126,19 @@ class BeamKernel(PlaneKernel):
 
     def onto(self, sag: Tensor, eta: float, fresnel: str, reference: float, receiver: Receiver, filter: Filter):
         """Control heights (n, m) float64 relative to `reference`, mm: see `_splat`."""
-        light, frame = (None, self._light(receiver, reference)), ScreenFrame.of(receiver.screen, receiver.low)
+        light, frame = (None, self._light(receiver, reference, eta)), ScreenFrame.of(receiver.screen, receiver.low)
         ends = self.z_in - reference, 0.0
         return self._splatted(sag, (eta, fresnel), ends, receiver.screen, filter, light, frame)
 
-    def _light(self, receiver: Receiver, reference: float) -> ParallelLight:
+    def _light(self, receiver: Receiver, reference: float, eta: float) -> ParallelLight:
         kx, ky = self.kx, self.ky
         middle = (*receiver.middle[:2], receiver.middle[2] - reference)
-        e1, e2, e3 = (Components(*map(float, axis)) for axis in receiver.axes)
-        c1, c2, c3 = (float(dot(middle, axis)) for axis in receiver.axes)
-        on1, on2, on3 = (float(dot((kx, ky, 1.0), axis)) for axis in receiver.axes)
+        along, up, (x, y, z) = receiver.axes
+        normal = (x, y, z) if eta * dot(receiver.axis, (x, y, z)) > 0 else (-x, -y, -z)
+        axes = along, up, normal
+        e1, e2, e3 = (Components(*map(float, axis)) for axis in axes)
+        c1, c2, c3 = (float(dot(middle, axis)) for axis in axes)
+        on1, on2, on3 = (float(dot((kx, ky, 1.0), axis)) for axis in axes)
         over_x, over_y = (1.0 / r for r in self.half_size)
         long2 = 1.0 + kx * kx + ky * ky
         return ParallelLight(kx, ky, long2, self.power, over_x, over_y, self.round, e1, e2, e3, c1, c2, c3, on1, on2, on3)
