@@ -371,6 +371,7 @@ READERS = {
     "source.power": _power,
     "source.wavelengths": _spectrum,
     "screen.radius": _radius,
+    "screen.tilt": lambda option, text: {"screen.tilt": list(numbers(option, text, (2, 3), ",", "two or three angles like 20,0"))},
     "rays": lambda option, text: {"rays": rays(option, text)},
     "screen_size": lambda option, text: {"screen_size": size(option, text)},
     "resolution": lambda option, text: {"resolution": counts(option, text)},

@@ -234,9 +234,9 @@ class SourceSettings(Section):
             " lens", option=Option("--cone", "DEG", BOTH))
     angle: float | None = setting("disc at infinity (the sun: 0.533): angular diameter", "degrees", 0.0, 170.0,
             derived="a disc at a finite distance", option=Option("--source-angle", "DEG", BOTH))
-    tilt: Pair = setting("direction of a plane wave: +z turned about the x axis, then about the y axis; the screen stands square to"
-            " its light unless told otherwise", "degrees", -80.0, 80.0, default=[0.0, 0.0], written=False,
-            option=Option("--source-tilt", "A,B", BOTH))
+    tilt: Pair = setting("direction of a plane wave or of a disc at infinity: +z turned about the x axis, then about the y axis;"
+            " the screen stands square to its light unless told otherwise", "degrees", -80.0, 80.0, default=[0.0, 0.0],
+            written=False, option=Option("--source-tilt", "A,B", BOTH))
     intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of"
             " degrees from +z and relative intensity", default="uniform", why="an isotropic source, the simplest",
             option=Option("--intensity", "uniform|lambertian|FILE", BOTH), file="intensity")
@@ -327,8 +327,9 @@ class ScreenSettings(Section):
             " millimetres")
     size: Pair = setting("full width and height", "mm", *SCREEN, derived="picture plus margin")
     resolution: Wholes = setting("pixels along x and y", low=2, high=16384, derived="250 across")
-    tilt: Pair = setting("rotation of the screen about its own centre: about the fixed x axis, then about the fixed y axis",
-            "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False, option=Option("--screen-tilt", "A,B", BOTH))
+    tilt: Numbers = setting("rotation of the screen about its own centre: about the fixed x axis, then about the fixed y axis;"
+            " before both, by a third angle, about its normal", "degrees", -180.0, 180.0, default=[0.0, 0.0], written=False,
+            option=Option("--screen-tilt", "A,B[,C]", BOTH))
     shift: Pair = setting("decentre of the screen; by default that of a mirror is shifted out of the light of its source", "mm",
             -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH))
     radius: Pair | None = setting("radii of curvature of a curved screen along x and y: the same for a sphere, inf along one axis"
