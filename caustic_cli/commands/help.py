@@ -17,7 +17,7 @@ BASICS = {
 #: Headings of the groups, and the sections of the table that they contain.
 GROUPS = {
     "Picture": ("target",),
-    "Light source": ("source",),
+    "Light source": ("source", "room"),
     "Lens": ("lens",),
     "Screen": ("screen", "second"),
     "Design": ("design",),
@@ -48,7 +48,7 @@ SYNONYMS = {
     **dict.fromkeys(("--negative", "--inverse"), "--invert"),
     **dict.fromkeys(("--mirror-image",), "--flip"),
     **dict.fromkeys(("--time", "--timeout"), "--time-limit"),
-    **dict.fromkeys(("--led", "--sun", "--light"), "--source"),
+    **dict.fromkeys(("--led", "--light"), "--source"),
     **dict.fromkeys(("--overwrite",), "--force"),
 }
 

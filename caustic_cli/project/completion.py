@@ -18,6 +18,7 @@ from caustic_cli.config.optional import (
     complete_network,
     complete_second,
     complete_second_size,
+    complete_sunlight,
     default_magnification,
     middle_distance,
     middle_source,
@@ -54,6 +55,7 @@ def complete(
         InputError: a value is out of range, or two contradict each other.
     """
     s, by = Settings.of(given), by or Parameters()
+    s = s.changed(source=complete_sunlight(s.source, s.room))
     refuse_contradictions(s)
     if s.target.sheet:
         aspect, lit = _aspect_of_a_sheet(s, aspect), (1.0, 1.0)

@@ -256,6 +256,19 @@ class SourceSettings(Section):
             BOTH))
 
 
+class RoomSettings(Section):
+    """[room]: the window in which the lens stands, in sunlight, from which the direction and the width of the light follow."""
+
+    section = "room"
+    place: Pair | None = setting("latitude to the north and longitude to the east", "degrees", -180.0, 180.0,
+            option=Option("--sun", "LAT,LON,TIME", BOTH), speaks_for=("room.time",))
+    time: str | None = setting("date and time with its offset from UTC (ISO 8601), like 2026-06-21T12:00+02:00")
+    faces: float = setting("azimuth to which the outer side of the pane looks, clockwise from north", "degrees", -360.0, 360.0,
+            default=180.0, why="a south window", option=Option("--faces", "AZIMUTH", BOTH))
+    slope: float = setting("angle between pane and horizontal: 90 for an upright window, 0 for a skylight", "degrees", 0.0, 180.0,
+            default=90.0, why="windows are upright", option=Option("--slope", "DEG", BOTH))
+
+
 class LensSettings(Section):
     """[lens]: the lens."""
 
@@ -529,7 +542,7 @@ class Parameters(Section):
     rays: int | None = setting("number of rays of the last default stage", low=1, high=10**12, derived="by quality",
             option=Option("--rays", "N"), before="design.loss")
 # fmt: on
-SECTIONS: tuple[type[Section], ...] = (SourceSettings, LensSettings, ScreenSettings, TargetSettings, SecondSettings)
+SECTIONS: tuple[type[Section], ...] = (SourceSettings, RoomSettings, LensSettings, ScreenSettings, TargetSettings, SecondSettings)
 SECTIONS += (ElementSettings, DesignSettings, StageSettings)
 
 
