@@ -520,6 +520,10 @@ class Parameters(Section):
 
     throw: float | None = setting("distance from the lens' origin to the screen, in front of a mirror", "mm", -1e12, 1e12,
             derived="300", option=Option("--throw", "MM"), speaks_for=("screen.z",), before="screen.z")
+    screen_place: str | None = setting("part of a room as the screen, where the light meets it: floor, ceiling or wall and its"
+            " distance from the lens, or any plane by a point, its normal towards the viewer and an upward direction",
+            derived="square to the light", option=Option("--screen", "PLACE"),
+            speaks_for=("screen.z", "screen.tilt", "screen.shift"), before="screen.z")
     screen_size: Pair | None = setting("full width and height of the screen; a single length keeps the picture's aspect ratio",
             "mm", derived="picture plus margin", option=Option("--screen-size", "W[xH]"), speaks_for=("screen.size",),
             before="screen.size")
@@ -528,6 +532,9 @@ class Parameters(Section):
             speaks_for=("screen.resolution",), before="screen.resolution")
     mag: float = setting("width of the picture in lens widths", low=1e-3, high=1e3, default=3.0, why="table 6.1 of the thesis",
             option=Option("--mag"), before="target.file")
+    picture_size: Pair | None = setting("full width and height of the picture on the screen instead of a magnification; a single"
+            " length keeps its aspect ratio", "mm", derived="by the magnification", option=Option("--picture-size", "W[xH]"),
+            speaks_for=("target.size",), before="target.file")
     margin: float = setting("total width of the dark border relative to the picture", low=0.0, high=100.0, default=0.28,
             why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, which shows stray light", option=Option("--margin"),
             before="target.file")
