@@ -309,6 +309,26 @@ def _power(option: str, text: str) -> dict[str, Any]:
     return {"source.power": watts, "source.power_unit": unit}
 
 
+def _sun(option: str, text: str) -> dict[str, Any]:
+    """Place and time: "48.1,11.6,2026-06-21T12:00+02:00"."""
+    form = "latitude, longitude and time like 48.1,11.6,2026-06-21T12:00+02:00"
+    latitude, longitude, time = [*text.split(",", 2), "", ""][:3]
+    if not time:
+        raise InputError(f"{option} must be {form}, got {text!r}")
+    place = numbers(option, f"{latitude},{longitude}", (2,), ",", form)
+    return {"room.place": list(place), "room.time": time.strip()}
+
+
+def _place(option: str, text: str) -> str:
+    """A part of a room, its distance in mm: "floor:1m" is "floor:1000"."""
+    name, colon, rest = text.strip().partition(":")
+    if not colon:
+        return name
+    distance, comma, azimuth = rest.partition(",")
+    form = "a part of a room and its distance like floor:1000, wall:2m or wall:2000,90"
+    return f"{name}:{numbers(option, distance, (1,), form=form, unit='mm')[0]:.15g}{comma}{azimuth}"
+
+
 def _radius(option: str, text: str) -> dict[str, Any]:
     """Radii of a screen: "60" for a sphere; "60,inf" or "inf,60" for a cylinder."""
     form = "one number of mm, or two with inf for straight, like 60, 60,inf or -8cm"
@@ -371,8 +391,12 @@ READERS = {
     "source.power": _power,
     "source.wavelengths": _spectrum,
     "screen.radius": _radius,
+    "screen.tilt": lambda option, text: {"screen.tilt": list(numbers(option, text, (2, 3), ",", "two or three angles like 20,0"))},
+    "room.place": _sun,
     "rays": lambda option, text: {"rays": rays(option, text)},
+    "screen_place": lambda option, text: {"screen_place": _place(option, text)},
     "screen_size": lambda option, text: {"screen_size": size(option, text)},
+    "picture_size": lambda option, text: {"picture_size": size(option, text)},
     "resolution": lambda option, text: {"resolution": counts(option, text)},
 }
 #: Help of options that are more restricted than their setting.
@@ -380,11 +404,13 @@ HELP = {
     "target.encoding": "Pixel values are linear irradiance, not sRGB-encoded.",
     "design.iterations": "Total number of iterations, including those before --resume.",
     "source.position": "Point (may be repeated), centre of a grid or disc, or origin of a ray file (mm).",
+    "room.place": "Light of the sun: place (degrees to the north and to the east) and time (with its offset from UTC), such as"
+    " 48.1,11.6,2026-06-21T12:00+02:00, for a lens in a window (--faces, --slope); a disc as wide as the sun, or --source plane.",
     "design.over": "Train a network whose inputs vary over ranges (mm), so that it gives a lens for every value, selected with --at"
     " in the other commands: throw=250:350; also source.x, source.y, source.z.",
     "target.flip": "Mirror the picture along x, y or xy, for a viewer on the lens' side.",
-    "lens.mirror": "The surface is a mirror; the screen is on the source's side, at the distance --throw, and shifted out"
-    " of the source's light unless --screen-shift says where.",
+    "lens.mirror": "The surface is a mirror; the screen is on the source's side, at the distance --throw, square to light of"
+    " --source-tilt, or else shifted out of the source's light, unless --screen-shift says where.",
     "source.wavelengths": "Spectrum of the source: wavelengths (nm) and relative powers; a --glass has its own index at each.",
 }
 #: Settings that are options of every command.

@@ -26,10 +26,11 @@ def keywords(command: str) -> dict[str, str]:
     """Paths of a command's settings by keyword: for design all of them, for render those that its options change."""
     rows = [row for row in TABLE.values() if row.option and command in row.option.commands and row.kind != "tables"]
     own = {row.path: row.option.name.lstrip("-").replace("-", "_") for row in rows if row.option}
+    settable = {path for row in rows for path in (row.path, *row.speaks_for)}
     found = dict(LISTED) if command == "design" else {}
     of_tables = {name for name, _ in TABLES.values() if name != "source"}
     for path, row in TABLE.items():
-        if row.kind != "tables" and row.section not in of_tables and (command == "design" or path in own):
+        if row.kind != "tables" and row.section not in of_tables and (command == "design" or path in settable):
             found[path.replace(".", "_")] = path
     return found | {name: path for path, name in own.items()}
 

@@ -1,4 +1,4 @@
-"""Completion of optional features: networks trained over ranges, two free-form sides, other elements.
+"""Completion of optional features: light of the sun, networks trained over ranges, two free-form sides, other elements.
 
 Each function completes its own part of the settings, if present, for `completion`.
 """
@@ -6,22 +6,107 @@ Each function completes its own part of the settings, if present, for `completio
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Any
 
 from caustic_cli.config.settings import Settings, build_source
-from caustic_cli.errors import InputError
+from caustic_cli.errors import InputError, alternatives
 from caustic_cli.inverse.scene_parameters import Ranges
+from caustic_cli.loading import OnDemand
+from caustic_cli.scene import sources
+from caustic_cli.scene.interaction import interaction_of
 from caustic_cli.scene.traits import TRAITS
 from caustic_cli.schema.table import (
     DesignSettings,
     ElementSettings,
+    Parameters,
+    RoomSettings,
+    ScreenSettings,
     SecondSettings,
     SourceSettings,
     check,
     default,
 )
 
+rooms, sunlights = OnDemand("caustic_cli.scene.room"), OnDemand("caustic_cli.scene.sunlight")
+room_screens = OnDemand("caustic_cli.scene.room_screen")
+
+#: Decimals of the angles that follow from a time, degrees, and how far a project's own may be from them.
+ANGLE_DECIMALS, SAME_ANGLE = 4, 0.01
 OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
 BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
+
+
+def sunlight(room: RoomSettings) -> tuple[Any, datetime]:
+    """The light of the sun in a window, `scene.sunlight.Sunlight`, and the time for which a lens is designed.
+
+    Raises:
+        InputError: a setting is missing or out of range.
+    """
+    if room.place is None or room.time is None:
+        raise InputError(
+            "[room] needs ⟨+room.place⟩, a place on earth and a time: without the sun, ⟨room.faces⟩ and ⟨room.slope⟩ have no use"
+        )
+    pane, place = rooms.Room(room.faces, room.slope), check("room.place", room.place)
+    return sunlights.Sunlight(pane, place), sunlights.moment(room.time)
+
+
+def complete_sunlight(source: SourceSettings, room: RoomSettings | None) -> SourceSettings:
+    """The source with the direction of the sun's light, and with the sun's width if it has one, where they are not given.
+
+    Raises:
+        InputError: there is no sunlight at that time, the source cannot be the sun, or has another direction.
+    """
+    if room is None:
+        return source
+    type = sources.type_of(source.type)
+    if "tilt" not in type.keys:
+        raise InputError(
+            f"⟨room.place⟩ needs ⟨source⟩ {alternatives(sources.used_by('tilt'))}, light from infinity, got {type.name}"
+        )
+    light, time = sunlight(room)
+    light.check(time)
+    tilt = [round(angle, ANGLE_DECIMALS) for angle in light.tilt(time)]
+    given = check("source.tilt", source.tilt) if "tilt" in source else tilt
+    if max(abs(a - b) for a, b in zip(given, tilt, strict=True)) > SAME_ANGLE:
+        raise InputError(
+            f"⟨source.tilt⟩ is {given[0]:g},{given[1]:g}, but the light of the sun at ⟨room.time⟩ has {tilt[0]:g},{tilt[1]:g}"
+            " degrees: remove the tilt, or the time and the place of the sun"
+        )
+    width = {"angle": round(light.sun(time).diameter, ANGLE_DECIMALS)} if "angle" in type.keys else {}
+    return source.filled(tilt=tilt, **width)
+
+
+def lit_by_sun(room: RoomSettings | None, by: Parameters) -> RoomSettings | None:
+    """The room, None where it has no sun and only gives the screen its place."""
+    dark = room is not None and room.place is None and room.time is None and by.screen_place is not None
+    return None if dark else room
+
+
+def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping[str, Any]) -> ScreenSettings:
+    """The screen in its place in the room; without one, square to light that is tilted and centred on it, where its own tilt and
+    shift are not given.
+
+    room, given: the sections [room] and [screen] as given.
+
+    Raises:
+        InputError: the place is not reached by the light, or the screen has two.
+    """
+    interaction, source = interaction_of(s.lens.mirror), build_source(s.source)
+    if by.screen_place is None:
+        if not source.oblique:
+            return s.screen
+        x, y, z = (abs(s.screen.z) / source.axis[2] * c for c in source.axis)
+        return s.screen.filled(tilt=[interaction.side * angle + 0.0 for angle in source.tilt], shift=[x, y])
+    twice = ["⟨throw⟩"] * (by.throw is not None) + [f"⟨screen.{key}⟩" for key in ("z", "tilt", "shift") if key in given]
+    if twice or s.elements:
+        why = f"{twice[0]} would be another" if twice else "⟨element⟩ has the screen on its own axis"
+        raise InputError(f"⟨screen_place⟩ gives the screen its distance, tilt and shift: {why}")
+    x, y, z = source.axis if source.distant else (-c / math.hypot(*source.centre) for c in source.centre)
+    pane = rooms.Room() if room is None else rooms.Room(room.faces, room.slope)
+    place = room_screens.placed(by.screen_place, pane, interaction.sent((x, y, z)), interaction.side)
+    return s.screen.changed(z=place.z, tilt=place.tilt, shift=place.shift)
 
 
 def middle_distance(over: Ranges, z: float, side: float, given: bool) -> float:

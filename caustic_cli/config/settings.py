@@ -12,6 +12,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
@@ -31,6 +32,7 @@ from caustic_cli.schema.table import (
     DesignSettings,
     ElementSettings,
     LensSettings,
+    RoomSettings,
     ScreenSettings,
     SecondSettings,
     Section,
@@ -62,7 +64,7 @@ _TOKEN = re.compile(
 
 def _schema() -> dict[str, dict[str, Setting]]:
     """Keys of every section: those of the table, and in [source] those that source types define."""
-    found = {section: in_section(section) for section in ("source", "lens", "screen", "target", "second", "design")}
+    found = {section: in_section(section) for section in ("source", "room", "lens", "screen", "target", "second", "design")}
     found["source"]["type"] = replace(found["source"]["type"], help=sources.in_words())
     found["source"] |= {key: Setting(f"source.{key}", *spec) for key, spec in sources.own_keys().items()}
     found["element"] = {}  # a list of tables, kept as the section's only key, "list"
@@ -205,6 +207,8 @@ def _typed(where: str, key: str, value, keys: dict[str, Setting]):
     if key not in keys:
         raise InputError(f"{where} is not a key{near(key, keys)}")
     kind = keys[key].kind
+    if kind == "text" and isinstance(value, datetime):
+        return value.isoformat()
     if kind in PLAIN:
         type, words = PLAIN[kind]
         if not isinstance(value, type):
@@ -244,6 +248,7 @@ class Settings:
     design: DesignSettings
     second: SecondSettings | None = None
     elements: tuple[ElementSettings, ...] = ()
+    room: RoomSettings | None = None
 
     @classmethod
     def of(cls, given: Given) -> Self:
@@ -261,6 +266,7 @@ class Settings:
             DesignSettings.of(design),
             SecondSettings.of(given["second"]) if "second" in given else None,
             tuple(map(ElementSettings, given.get("element", {}).get("list", ()))),
+            RoomSettings.of(given["room"]) if "room" in given else None,
         )
 
     def changed(self, **sections: Any) -> Self:
@@ -292,7 +298,15 @@ def dump(settings: Settings) -> str:
         f"format_version = {FORMAT_VERSION}",
         f'created_by = "caustic {__version__}"',
     ]
-    for section in (settings.source, settings.lens, settings.screen, settings.target, settings.second, settings.design):
+    for section in (
+        settings.source,
+        settings.room,
+        settings.lens,
+        settings.screen,
+        settings.target,
+        settings.second,
+        settings.design,
+    ):
         also = section.also if isinstance(section, SourceSettings) else ()
         for table in () if section is None else (section, *also):
             lines += ["", f"[[{table.section}]]" if also else f"[{table.section}]", *_assignments(table, SCHEMA[table.section])]
@@ -323,7 +337,7 @@ def tables_of(settings: Settings) -> Given:
             return {key: plain(one) for key, one in value.items()}
         return [plain(one) for one in value] if isinstance(value, tuple) else value
 
-    found = {name: plain(getattr(settings, name)) for name in ("source", "lens", "screen", "target", "design", "second")}
+    found = {name: plain(getattr(settings, name)) for name in ("source", "room", "lens", "screen", "target", "design", "second")}
     if settings.elements:
         found["element"] = {"list": plain(settings.elements)}
     return {name: table for name, table in found.items() if table is not None}
@@ -502,13 +516,14 @@ def by_section(given: Mapping[str, Any]) -> Given:
 
 
 def implied(given: Given) -> Given:
-    """Given of one level, a file or the options, with those that they imply: a diameter at infinity a disc, and a network adam.
+    """Given of one level, a file or the options, with those that they imply: a diameter at infinity or a time of the sun a disc,
+    and a network adam.
 
     A type or an optimiser of the same level takes precedence, those of other levels do not.
     """
     source, design = given.get("source", {}), given.get("design", {})
     out = dict(given)
-    if "angle" in source:
+    if "angle" in source or "time" in given.get("room", {}):
         out["source"] = {"type": "disc", **source}
     if design.get("network", "none") != "none":
         out["design"] = {"optimizer": "adam", **design}

@@ -22,11 +22,12 @@ from torch import Tensor
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident, lit_rectangle
-from caustic_cli.inverse.projection import BeamProjection, ScreenProjection
+from caustic_cli.inverse.projection import BeamProjection, ScreenProjection, seen_by_light
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import cell_lines, cell_means, corners
+from caustic_cli.optics.interface import slopes_inside
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Component, Lens, Scene
@@ -121,7 +122,7 @@ class _Grid:
     @property
     def floor(self) -> float:
         """Least height of the exit by the least thickness, mm."""
-        return self.scene.lens.z_in + self.scene.lens.min_thickness
+        return self.scene.lens.floor
 
     def scaled(self, values: np.ndarray, onto: _Grid) -> np.ndarray:
         """Values at the corners, interpolated at those of another grid."""
@@ -266,6 +267,7 @@ def first_surface(
         InputError: the picture cannot be reached by refraction.
     """
     began = time.monotonic()
+    scene, target = seen_by_light(scene, target)
     times, options = _refinement(cells, target) if scene.source.distant else 1, {}
     cells = min(cells, SOLVED * times)
     if times > 1:
@@ -273,8 +275,12 @@ def first_surface(
     grid, lens = _Grid.of(scene, target, cells // times), scene.lens
     z = grid.offset
     if scene.source.oblique:  # the shadow of the lens' sides depends on the heights
-        rough = _Grid.of(scene, target, ROUGH)
-        surface = extended(*rough.places, rough.solved(*rough.incident(rough.offset), float(rough.offset.mean())).heights)
+        begun = _in_aperture(lens) if lens.mirror else lens.offset.heights
+        rough = _Grid.of(scene, target, ROUGH, begun)
+        solved = rough.solved(*rough.incident(begun(*rough.places)), float(rough.offset.mean())).heights
+        if lens.mirror:  # with its edge in the aperture of the light, none of which then passes it
+            solved = solved + lens.pupil.z - _edge(solved, slopes_inside(scene.source.axis, 1.0))
+        surface = extended(*rough.places, solved)
         grid = _Grid.of(scene, target, cells // times, surface)
         z = surface(*grid.places)
     if scene.source.distant or lens.mirror or scene.elements:
@@ -381,6 +387,17 @@ def departure_bound(element: Component, lens: Lens) -> float:
     thickness."""
     thinnest = element.thinnest
     return min(lens.height_range[1], THICKNESS_PART * thinnest)
+
+
+def _in_aperture(lens: Lens) -> Surface:
+    """The plane of the aperture that the source illuminates."""
+    return lambda x, y: np.full((len(x), len(y)), lens.pupil.z)
+
+
+def _edge(z: np.ndarray, slopes: tuple[float, float]) -> float:
+    """Mean height along the edge, of the sides along y and those along x by the slope of light across them."""
+    (across, along), sides = (abs(s) for s in slopes), (z[[0, -1]].mean(), z[:, [0, -1]].mean())
+    return float((across * sides[0] + along * sides[1]) / (across + along))
 
 
 def _middle(z: np.ndarray) -> float:

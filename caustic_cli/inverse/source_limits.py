@@ -168,7 +168,7 @@ def etendue_limit(scene: Scene) -> float | None:
     x, y, cell = _area(lens.half_size, lens.opening)
     area = cell * len(x)
     if source.distant:
-        given = area * math.pi * math.sin(source.half_angle) ** 2
+        given = area * math.pi * math.sin(source.half_angle) ** 2 * source.axis[2]
     elif min(source.extent) > 0 and len(source.points()[0]) == 1:
         a, b, part = _area(source.extent, CircularAperture())
         x0, y0, z0 = source.points()[0][0]

@@ -181,11 +181,11 @@ def refuse_obstructed(scene: Scene, designed: bool = False) -> None:
     """
     way = LightPath(scene)
     if (part := way.lit_face()) < 1.0:
-        last = way.elements[-1].name
-        wrong = f"{last} is behind the screen" if part == 0.0 else f"the plane of the screen passes through {last}"
+        last, beyond = way.elements[-1].name, "behind" if scene.behind else scene.lens.interaction.beyond
         raise InputError(
-            f"{wrong}, whose back {100.0 * (1.0 - part):.3g}% of the light would arrive at; accepted: less ⟨+screen.tilt⟩, or a"
-            f" ⟨+screen.shift⟩ with which the screen faces {last}"
+            f"the screen must lie {beyond} {last} and face it:"
+            f" {'its plane passes through it' if part else 'it turns its back to it'}, so that {100.0 * (1.0 - part):.3g}% of the"
+            " light would arrive from behind; accepted: less ⟨+screen.tilt⟩, or another ⟨+screen.shift⟩ or ⟨+throw⟩"
         )
     found = way.obstruction()
     if found is None:

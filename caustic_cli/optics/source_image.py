@@ -18,6 +18,7 @@ import math
 
 import numpy as np
 
+from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.screen_shape import normals, points_in_space
 from caustic_cli.optics.spread import Spread
 from caustic_cli.scene import Scene
@@ -127,7 +128,8 @@ def _arriving(scene: Scene, exit: np.ndarray, moved: tuple[float, float]) -> np.
     lens, source = scene.lens, scene.source
     n = lens.inside
     if source.distant:
-        p, q = (m / n for m in moved)
+        length = math.sqrt(1.0 - moved[0] ** 2 - moved[1] ** 2)
+        p, q = (length * m / n for m in turned_about(source.axis, *(m / length for m in moved))[:2])
         return np.array([p, q, math.sqrt(1.0 - p * p - q * q)]) + 0.0 * exit
     d = exit[..., :2] - np.array(source.centre[:2]) - np.array(moved)
     entrance = lens.interaction.entered(lens.z_in, exit[..., 2])

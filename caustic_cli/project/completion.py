@@ -18,9 +18,12 @@ from caustic_cli.config.optional import (
     complete_network,
     complete_second,
     complete_second_size,
+    complete_sunlight,
     default_magnification,
+    lit_by_sun,
     middle_distance,
     middle_source,
+    stand,
 )
 from caustic_cli.config.settings import Given, Settings, build_screen, build_source, index_of
 from caustic_cli.errors import InputError
@@ -54,6 +57,8 @@ def complete(
         InputError: a value is out of range, or two contradict each other.
     """
     s, by = Settings.of(given), by or Parameters()
+    room, s = s.room, s.changed(room=lit_by_sun(s.room, by))
+    s = s.changed(source=complete_sunlight(s.source, s.room))
     refuse_contradictions(s)
     if s.target.sheet:
         aspect, lit = _aspect_of_a_sheet(s, aspect), (1.0, 1.0)
@@ -69,7 +74,7 @@ def complete(
         s = s.changed(source=at, design=complete_network(s.design))
     if over or relative_to_initial(s.design):
         s = s.changed(design=s.design if "initial" in given.get("design", {}) else s.design.changed(initial="zero-last"))
-    s = s.changed(second=complete_second(s))
+    s = s.changed(second=complete_second(s), screen=stand(s, by, room, given.get("screen", {})))
     s = s.changed(target=complete_target(s, by, aspect))
     s = s.changed(screen=complete_screen(s.screen, s.target, by))
     s = s.changed(second=complete_second_size(s))
@@ -77,7 +82,6 @@ def complete(
     build_screen(s.screen)
     source = build_source(s.source)
     s = s.changed(lens=complete_lens(s, source))
-    s = s.changed(screen=facing(s))
     return complete_design(Defaults(s, source, by.quality, by.rays, lit, gaps))
 
 
@@ -138,19 +142,13 @@ def complete_source(
     return source.without(*{*SourceSettings.of({})}.difference(sources.COMMON, *(type.keys for type in types)))
 
 
-def facing(s: Settings) -> ScreenSettings:
-    """The screen, square to light that is tilted, passed on or reflected, and centred on it, where its own tilt and shift are not
-    given."""
-    tilt = s.source.tilt
-    if tilt is None or not any(tilt):
-        return s.screen
-    interaction, (dx, dy, dz) = interaction_of(s.lens.mirror), build_source(s.source).axis
-    reach = abs(s.screen.z - interaction.front(s.lens.z_in, s.lens.thickness)) / dz
-    return s.screen.filled(tilt=[interaction.side * angle + 0.0 for angle in tilt], shift=[reach * dx, reach * dy])
-
-
 def complete_target(s: Settings, by: Parameters, aspect: float) -> TargetSettings:
     """The target with its size on the screen."""
+    if by.picture_size is not None:
+        if "mag" in by:
+            raise InputError("⟨picture_size⟩ and ⟨mag⟩ both give the picture's size: give one of them")
+        width, height = (*by.picture_size, by.picture_size[0] * aspect)[:2]
+        return s.target.changed(size=(width, height))
     if "size" in s.target and "mag" not in by:
         return s.target
     if "size" in s.screen and "mag" not in by:
@@ -197,7 +195,7 @@ def _missing_room(lens: LensSettings) -> float:
     """
     x, y = (np.array([0.0, width / 2.0]) for width in lens.size)
     lowest = lens.thickness + float(Offset(0.0, lens.radius).sag(x[:, None], y[None, :]).min())
-    short = lens.z_in + lens.min_thickness - lowest
+    short = interaction_of(lens.mirror).base(lens.z_in) + lens.min_thickness - lowest
     return short if short >= lens.height_range[1] else 0.0
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from caustic_cli.config import settings
 from caustic_cli.config.design import build_options, build_stages
+from caustic_cli.config.optional import complete_sunlight
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError, no_project, plain
 from caustic_cli.inverse.designer import Designer, State
@@ -34,7 +35,7 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.completion import complete, complete_source
 from caustic_cli.scene import Scene, sources
 from caustic_cli.scene.sources.section import content
-from caustic_cli.schema.table import SourceSettings, TargetSettings
+from caustic_cli.schema.table import RoomSettings, SourceSettings, TargetSettings
 
 TOML, CHECKPOINT, RENDER, WAVE, REPORT = "project.toml", "checkpoints.h5", "render.png", "wave.png", "report.png"
 #: Name of the image on the second screen, of a design with one.
@@ -133,6 +134,11 @@ class Project:
         """The picture on a screen farther away, irradiance, or None."""
         return content(self.settings.second or {}, "file", np.ndarray)
 
+    def room(self, given: Mapping[str, Any]) -> RoomSettings | None:
+        """The [room] section, in which `given`, path -> value, overrides settings; None without one."""
+        own = settings.by_section(given).get("room", {})
+        return RoomSettings.of({**(self.settings.room or {}), **own}) if own or self.settings.room else None
+
     @property
     def over(self) -> Ranges | None:
         """Ranges over which its network is trained, or None."""
@@ -165,7 +171,11 @@ class Project:
                 raise self.error(f"{error}") from error
         own = attachments.attached(settings.implied(settings.by_section(given)))
         s = self.settings
-        other = _other_source(s.source, own.get("source", {}))
+        other, room = _other_source(s.source, own.get("source", {})), self.room(given)
+        if "room" in own:  # another light of the sun
+            other = {key: value for key, value in other.items() if key not in {"tilt", "angle"} - own.get("source", {}).keys()}
+        if room is not None and ("room" in own or "tilt" not in own.get("source", {})):
+            other = dict(complete_sunlight(SourceSettings(other), room))
         settings.refuse_unused(other, given)
         # Further conditions of a design on its source do not apply to an image.
         if s.target.color:

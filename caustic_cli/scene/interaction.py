@@ -9,7 +9,7 @@ Notation
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -55,8 +55,8 @@ class Refracting:
         """z that the surface must not fall below, mm: of the flat face where light enters."""
         return z_in
 
-    def front(self, z_in: float, vertex: float) -> float:
-        """z of the aperture that a source illuminates, mm: of the entrance, or of the vertex of the surface."""
+    def front(self, z_in: float, edge: Callable[[], float]) -> float:
+        """z of the aperture that a source illuminates, mm: of the entrance, or of the edge of the surface."""
         return z_in
 
     def entered(self, z_in: float, z: np.ndarray) -> np.ndarray:
@@ -87,6 +87,10 @@ class Refracting:
         square = 1.0 - n * n * (1.0 - along * along)
         side = np.where(along < 0, -1.0, 1.0)
         return n * (d - along * normal) + side * np.sqrt(np.maximum(square, 0.0)) * normal, square[..., 0] > 0
+
+    def sent(self, d: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Direction behind a surface without slopes of light that arrives along d."""
+        return d[0], d[1], self.side * d[2]
 
     def check_screen(self, z: float, z_in: float) -> None:
         """Check that a screen at z is on the side to which light leaves.
@@ -136,9 +140,9 @@ class Reflecting(Refracting):
         """None."""
         return -math.inf
 
-    def front(self, z_in: float, vertex: float) -> float:
-        """Of the vertex."""
-        return vertex
+    def front(self, z_in: float, edge: Callable[[], float]) -> float:
+        """Of the edge."""
+        return edge()
 
     def entered(self, z_in: float, z: np.ndarray) -> np.ndarray:
         """At the surface itself."""

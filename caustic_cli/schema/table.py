@@ -234,9 +234,9 @@ class SourceSettings(Section):
             " lens", option=Option("--cone", "DEG", BOTH))
     angle: float | None = setting("disc at infinity (the sun: 0.533): angular diameter", "degrees", 0.0, 170.0,
             derived="a disc at a finite distance", option=Option("--source-angle", "DEG", BOTH))
-    tilt: Pair = setting("direction of a plane wave: +z turned about the x axis, then about the y axis; the screen stands square to"
-            " its light unless told otherwise", "degrees", -80.0, 80.0, default=[0.0, 0.0], written=False,
-            option=Option("--source-tilt", "A,B", BOTH))
+    tilt: Pair = setting("direction of a plane wave or of a disc at infinity: +z turned about the x axis, then about the y axis;"
+            " the screen stands square to its light unless told otherwise", "degrees", -80.0, 80.0, default=[0.0, 0.0],
+            written=False, option=Option("--source-tilt", "A,B", BOTH))
     intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of"
             " degrees from +z and relative intensity", default="uniform", why="an isotropic source, the simplest",
             option=Option("--intensity", "uniform|lambertian|FILE", BOTH), file="intensity")
@@ -256,6 +256,19 @@ class SourceSettings(Section):
             BOTH))
 
 
+class RoomSettings(Section):
+    """[room]: the window in which the lens stands, in sunlight, from which the direction and the width of the light follow."""
+
+    section = "room"
+    place: Pair | None = setting("latitude to the north and longitude to the east", "degrees", -180.0, 180.0,
+            option=Option("--sun", "LAT,LON,TIME", BOTH), speaks_for=("room.time",))
+    time: str | None = setting("date and time with its offset from UTC (ISO 8601), like 2026-06-21T12:00+02:00")
+    faces: float = setting("azimuth to which the outer side of the pane looks, clockwise from north", "degrees", -360.0, 360.0,
+            default=180.0, why="a south window", option=Option("--faces", "AZIMUTH", BOTH))
+    slope: float = setting("angle between pane and horizontal: 90 for an upright window, 0 for a skylight", "degrees", 0.0, 180.0,
+            default=90.0, why="windows are upright", option=Option("--slope", "DEG", BOTH))
+
+
 class LensSettings(Section):
     """[lens]: the lens."""
 
@@ -266,7 +279,7 @@ class LensSettings(Section):
             checks.LENGTH, default=0.0, why="the origin of the lens")
     thickness: float = setting("centre height of the base surface above the lens' origin", "mm", -checks.LENGTH, checks.LENGTH,
             derived="half the width of a lens up to 20 mm; for a wider one, a least wall of 3 mm; with two free-form sides twice"
-            " the width", why="table D.2 of the thesis; a plate is thin; two sides need a distance",
+            " the width; 0 of a mirror", why="table D.2 of the thesis; a plate is thin; two sides need a distance",
             option=Option("--thickness", "MM"))
     radius: Pair = setting("radii of the base surface along x and y; inf is flat, positive is diverging", "mm",
             derived="the sphere that spreads the light over the picture", why="table 6.1 of the thesis")
@@ -327,10 +340,11 @@ class ScreenSettings(Section):
             " millimetres")
     size: Pair = setting("full width and height", "mm", *SCREEN, derived="picture plus margin")
     resolution: Wholes = setting("pixels along x and y", low=2, high=16384, derived="250 across")
-    tilt: Pair = setting("rotation of the screen about its own centre: about the fixed x axis, then about the fixed y axis",
-            "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False, option=Option("--screen-tilt", "A,B", BOTH))
-    shift: Pair = setting("decentre of the screen; by default that of a mirror is shifted out of the light of its source", "mm",
-            -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH))
+    tilt: Numbers = setting("rotation of the screen about its own centre: about the fixed x axis, then about the fixed y axis;"
+            " before both, by a third angle, about its normal", "degrees", -180.0, 180.0, default=[0.0, 0.0], written=False,
+            option=Option("--screen-tilt", "A,B[,C]", BOTH))
+    shift: Pair = setting("decentre of the screen; by default on light that is tilted, and beside the light of the source of a"
+            " mirror", "mm", -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH))
     radius: Pair | None = setting("radii of curvature of a curved screen along x and y: the same for a sphere, inf along one axis"
             " for a cylinder; positive bends the edges towards +z, away from a lens", "mm", derived="plane", written=False,
             option=Option("--screen-radius", "R[,RY]", BOTH))
@@ -506,6 +520,10 @@ class Parameters(Section):
 
     throw: float | None = setting("distance from the lens' origin to the screen, in front of a mirror", "mm", -1e12, 1e12,
             derived="300", option=Option("--throw", "MM"), speaks_for=("screen.z",), before="screen.z")
+    screen_place: str | None = setting("part of a room as the screen, where the light meets it: floor, ceiling or wall and its"
+            " distance from the lens, or any plane by a point, its normal towards the viewer and an upward direction",
+            derived="square to the light", option=Option("--screen", "PLACE"),
+            speaks_for=("screen.z", "screen.tilt", "screen.shift"), before="screen.z")
     screen_size: Pair | None = setting("full width and height of the screen; a single length keeps the picture's aspect ratio",
             "mm", derived="picture plus margin", option=Option("--screen-size", "W[xH]"), speaks_for=("screen.size",),
             before="screen.size")
@@ -514,6 +532,9 @@ class Parameters(Section):
             speaks_for=("screen.resolution",), before="screen.resolution")
     mag: float = setting("width of the picture in lens widths", low=1e-3, high=1e3, default=3.0, why="table 6.1 of the thesis",
             option=Option("--mag"), before="target.file")
+    picture_size: Pair | None = setting("full width and height of the picture on the screen instead of a magnification; a single"
+            " length keeps its aspect ratio", "mm", derived="by the magnification", option=Option("--picture-size", "W[xH]"),
+            speaks_for=("target.size",), before="target.file")
     margin: float = setting("total width of the dark border relative to the picture", low=0.0, high=100.0, default=0.28,
             why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, which shows stray light", option=Option("--margin"),
             before="target.file")
@@ -528,7 +549,7 @@ class Parameters(Section):
     rays: int | None = setting("number of rays of the last default stage", low=1, high=10**12, derived="by quality",
             option=Option("--rays", "N"), before="design.loss")
 # fmt: on
-SECTIONS: tuple[type[Section], ...] = (SourceSettings, LensSettings, ScreenSettings, TargetSettings, SecondSettings)
+SECTIONS: tuple[type[Section], ...] = (SourceSettings, RoomSettings, LensSettings, ScreenSettings, TargetSettings, SecondSettings)
 SECTIONS += (ElementSettings, DesignSettings, StageSettings)
 
 

@@ -114,7 +114,9 @@ def modes(scene: Illuminated, each: int) -> list[Mode]:
     source = scene.source
     if source.distant:
         spread = _spots(source, each)
-        return [Mode(scene, _direction(source, dx, dy), 1.0 / len(spread)) for dx, dy in spread]
+        ways = [_direction(source, dx, dy) for dx, dy in spread]
+        whole = math.fsum(z for *_, z in ways) if source.oblique else len(ways)  # of the radiance, the cosine to the aperture
+        return [Mode(scene, way, (way[2] if source.oblique else 1.0) / whole) for way in ways]
     (positions, parts), spread = source.points(), _spots(source, each)
     return [
         Mode(scene, (float(x + dx), float(y + dy), float(z)), float(part) / len(spread))
