@@ -105,7 +105,7 @@ def test_places_out_of_the_light_are_refused(text, words):
 @pytest.mark.parametrize("over", [False, True])
 def test_axes_as_the_light_sees_them(turn, over):
     """Picture and screen are changed together: power stays where it is in space."""
-    x, y, z = tilted((20.0, 0.0, turn))
+    x, _, z = tilted((20.0, 0.0, turn))
     screen = Screen((30.0, 20.0), 100.0, (3, 2), tilt_to(x, (-z[0], -z[1], -z[2])) if over else (20.0, 0.0, turn), (0.0, -36.0))
     scene, target = Scene(PlaneWave(tilt=(20.0, 0.0)), Lens(), screen), np.arange(6.0).reshape(3, 2)
     other, moved = seen_by_light(scene, target)
