@@ -42,7 +42,7 @@ CONVOLUTION = Capability(
     "design by convolution with the source",
     {
         "separate places": "its places have images of their own",
-        **dict.fromkeys(("tilted screen", "curved screen"), "the image of the source varies over the screen"),
+        "curved screen": "the image of the source varies over the screen",
         **dict.fromkeys(("other elements", "folded axis"), "the blur by the lens alone is not that on the screen"),
     },
 )

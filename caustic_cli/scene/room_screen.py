@@ -22,6 +22,8 @@ FORM = (
 )
 #: Least sine between two directions that are not parallel.
 APART = 1e-6
+#: Of the angles, degrees, and positions, mm, of a screen: below them is rounding.
+DECIMALS = 9
 NAMES = ("floor", "ceiling", "wall")
 
 
@@ -39,7 +41,7 @@ class Placement(NamedTuple):
     """Where a screen is, as of `Screen`."""
 
     z: float
-    tilt: tuple[float, float, float]
+    tilt: tuple[float, ...]
     shift: tuple[float, float]
 
 
@@ -69,7 +71,9 @@ def placed(text: str, room: Room, light: Vector, side: int) -> Placement:
         centre = x, y, z
     if facing <= APART:
         raise InputError(f"⟨screen_place⟩ {text} faces away from the light: its normal must point towards the lens")
-    return Placement(centre[2], tilt_to(_cross(plane.up, plane.normal), plane.normal), centre[:2])
+    a, b, c = (round(angle, DECIMALS) + 0.0 for angle in tilt_to(_cross(plane.up, plane.normal), plane.normal))
+    x, y, z = (round(position, DECIMALS) + 0.0 for position in centre)
+    return Placement(z, (a, b, c) if c else (a, b), (x, y))
 
 
 def _named(text: str, room: Room, side: int) -> Plane:

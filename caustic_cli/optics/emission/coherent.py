@@ -125,6 +125,16 @@ def modes(scene: Illuminated, each: int) -> list[Mode]:
     ]
 
 
+def offset(source: Source, position: tuple[float, float, float]) -> tuple[float, float]:
+    """Displacement of a mode's position from the source's centre, mm, or of a direction from its axis, in sines."""
+    x, y, z = position
+    if not source.distant:
+        return x - source.centre[0], y - source.centre[1]
+    a, b, c = source.axis
+    along = (x * a + y * b) / (1.0 + c) + z  # the rotation that takes the axis to +z without twist
+    return x - a * along, y - b * along
+
+
 def _direction(source: Source, across: float, along: float) -> tuple[float, float, float]:
     """Unit direction with these components across the axis of a distant source."""
     c = math.sqrt(1.0 - across * across - along * along)
