@@ -100,7 +100,7 @@ def prepared_intersection(tracer) -> Callable[[Tensor], SurfaceIntersection] | N
     surface, pupil = element.surface, system.pupil
     if not isinstance(surface, HeightField) or tracer.sides[first] < 0 or not element.pose.upright:
         return None
-    if first == 0 and start.sample is None:  # they may start on either side of a surface that intersects the pupil
+    if first == 0 and system.lit is None and start.sample is None:
         return None
     px, py, pz = element.pose.position
     centred = (px, py) == (0.0, 0.0)
@@ -117,8 +117,34 @@ def prepared_intersection(tracer) -> Callable[[Tensor], SurfaceIntersection] | N
         return sampled
     spread = start.expanded()
     full = spread.full((*spread.origin, *spread.direction))
-    origin = (full[0] - px, full[1] - py, full[2] + (start.datum - pz))
-    return tracer.backend.intersect_fixed(surface, origin, full[3:])
+    origin, direction = (full[0] - px, full[1] - py, full[2] + (start.datum - pz)), full[3:]
+    if first > 0:
+        return tracer.backend.intersect_fixed(surface, origin, direction)
+    return _from_afar(tracer, surface, origin, direction)
+
+
+def _from_afar(tracer, surface: HeightField, origin: tuple, direction: tuple) -> Callable[[Tensor], SurfaceIntersection]:
+    """Intersections of rays that may start on either side of a surface, which intersects their pupil: from half a width before it,
+    or from in front of a surface that reaches farther."""
+    room = max(surface.half_size)
+
+    def moved(by: float) -> tuple[Tensor, tuple]:
+        way = -by / direction[2]
+        return way, tuple(o + way * d for o, d in zip(origin, direction, strict=True))
+
+    back, starts = moved(room)
+    fixed, last = tracer.backend.intersect_fixed(surface, starts, direction), float(starts[2].max())
+
+    def met(heights: Tensor) -> SurfaceIntersection:
+        beyond = last - surface.hull(heights)[0]
+        if beyond < 0.0:
+            hit, way = fixed(heights), back
+        else:
+            way, far = moved(room + beyond + BEFORE)
+            hit = tracer.backend.intersect_spline(surface, heights, far, direction, 1.0)
+        return hit._replace(t=hit.t + way)
+
+    return met
 
 
 def _cast(value, dtype: torch.dtype):
