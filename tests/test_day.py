@@ -37,7 +37,7 @@ def project(tmp_path_factory):
 def follower(project):
     lens = load(project)
     plan = lens.plan()
-    return Follower(plan.scene, lens.field, lens.heights, lens.target, LIGHT, rays=20_000, requests=plan.requests)
+    return Follower(plan.scene, lens.field, lens.heights, lens.target, LIGHT, rays=20_000)
 
 
 def test_a_screen_moves_in_its_plane():

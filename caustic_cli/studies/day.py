@@ -13,12 +13,12 @@ Notation
     on screen   legible, and at least PART of the power of the followed picture still lands on the screen where it stands
 
 Powers are those of a beam of constant irradiance across it, of which the pane receives the cosine of its incidence: air, which
-weakens a low sun, is not in them.  The effects that are simulated are those of the plan of the design.
+weakens a low sun, is not in them.  Stray light is left out: ghosts, and what meets a surface twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta, tzinfo
 from itertools import groupby, pairwise
@@ -32,7 +32,6 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import SOFTWARE, atomic_file
-from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.misalignment import Misalignment, landing_points
@@ -48,8 +47,8 @@ from caustic_cli.studies.retrace import limited_to_source, mean_of, sampler_for
 from caustic_cli.studies.tolerances import best_shift
 
 DAY = Capability("a day of sunlight", {"curved screen": "⟨day⟩ moves a plane screen after its picture, and this one has {}"})
-#: Rays of a time, both halves included, and those that find the median of the light.
-RAYS, FINDING = 200_000, 4_000
+#: Rays of a time, both halves included; rays that find the median of the light, and points along the coarse surface that they pass.
+RAYS, FINDING, COARSE = 200_000, 4_000, 64
 #: Periods of a day, properties of it.
 PERIODS = ("as_designed", "legible", "on_screen")
 #: Steps while the sun shines through the pane, minutes, and most times between them.
@@ -62,6 +61,8 @@ AROUND = 3
 QUIET = 30.0
 
 T = TypeVar("T")
+#: Along the screen's axes from its centre, mm, and power, (N,) each, in parts.
+Landing = list[tuple[Tensor, Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Follower:
     """Follows the picture of a lens under the sun.
 
     Args:
-        scene, field, heights, requests: of a plan; the scene's source is the light of the design; heights (n, m) mm.
+        scene, field, heights: of a plan; the scene's source is the light of the design; heights (n, m) mm.
         target: (n_x, n_y) or (3, n_x, n_y) on the screen.
         light: of the sun.
     """
@@ -120,11 +121,11 @@ class Follower:
         rays: int = RAYS,
         seed: int = 0,
         device: str = "cpu",
-        requests: Requests = NO_REQUESTS,
     ):
         self.scene, self.field, self.heights, self.target, self.light = scene, field, heights, target, light
-        self.rays, self.seed, self.device, self.requests = rays, seed, device, requests
-        self._start = self._median(scene)
+        self.rays, self.seed, self.device = rays, seed, device
+        self._coarse = _coarse(field, heights)
+        self._start = _median(self._landing(scene))
         self._image, self.offset, self.error, _ = self._followed(scene, (0.0, 0.0))
         self._power = self._on_picture(self._image) * scene.source.axis[2]
 
@@ -142,38 +143,43 @@ class Follower:
     def at(self, time: datetime) -> Seen:
         """The picture at a time at which the sun shines through the pane."""
         sun, scene = self.light.sun(time), replace(self.scene, source=replace(self.scene.source, tilt=self.light.tilt(time)))
-        cosine = scene.source.axis[2]
-        median = self._median(scene)
-        there = tuple(a - b for a, b in zip(median, self._start, strict=True))
-        image, at, followed, whole = self._followed(scene, (there[0], there[1]))
-        pixels = tuple(n * (AROUND - 1) // 2 for n in scene.screen.resolution)
-        around = self._halves(scene, scene.screen.grown((pixels[0], pixels[1])))
-        inner = (..., *(slice(n, n + m) for n, m in zip(pixels, scene.screen.resolution, strict=True)))
-        still = [replace(half, image=half.image[inner]) for half in around]
-        lands = float(mean_of(still).image.sum())
+        cosine, landing = scene.source.axis[2], self._landing(scene)
+        place = _median(landing)
+        image, at, followed, whole = self._followed(scene, (place[0] - self._start[0], place[1] - self._start[1]))
+        around, still = self._where_it_stands(scene, landing)
+        lands = 0.0 if still is None else float(mean_of(still).image.sum())
         instant = Instant(
             time,
             sun.azimuth,
             sun.elevation,
             float(np.degrees(np.arccos(min(1.0, cosine)))),
-            self._error(still) if lands > 0 else None,
+            self._error(still) if still is not None and lands > 0 else None,
             followed,
             (at[0] - self.offset[0], at[1] - self.offset[1]),
             self._on_picture(image) * cosine / self._power if self._power else 0.0,
             lands / whole if whole else 0.0,
         )
-        return Seen(instant, image * cosine, mean_of(around).image.cpu().numpy() * cosine)
+        return Seen(instant, image * cosine, around * cosine)
+
+    def _where_it_stands(self, scene: Scene, landing: Landing) -> tuple[np.ndarray, list[Image] | None]:
+        """Image around the screen where it stands, and halves of that on it; black and None where no light comes near it."""
+        pixels = tuple(n * (AROUND - 1) // 2 for n in scene.screen.resolution)
+        view = scene.screen.grown((pixels[0], pixels[1]))
+        if not any(bool(((abs(x) < view.half_size[0]) & (abs(y) < view.half_size[1]) & (w > 0)).any()) for x, y, w in landing):
+            return np.zeros((*self.target.shape[:-2], *view.resolution)), None
+        halves = self._halves(scene, view)
+        inner = (..., *(slice(n, n + m) for n, m in zip(pixels, scene.screen.resolution, strict=True)))
+        return mean_of(halves).image.cpu().numpy(), [replace(half, image=half.image[inner]) for half in halves]
 
     def _followed(self, scene: Scene, at: tuple[float, float]) -> tuple[np.ndarray, tuple[float, float], float, float]:
         """Image on the screen moved after the picture from `at`, mm; by how much; F; and the power there."""
-        for last in (False, True):
-            halves = self._halves(scene, moved(scene.screen, *at))
-            image = mean_of(halves).image.cpu().numpy()
-            if last or not image.sum() > 0:
-                break
-            grey = [a.sum(0) if a.ndim == 3 else a for a in (image, self.target)]
+        first = next(self._images(scene, moved(scene.screen, *at))).image.cpu().numpy()
+        if first.sum() > 0:
+            grey = (a.sum(0) if a.ndim == 3 else a for a in (first, self.target))
             _, shift = best_shift(*(a / a.mean() for a in grey))
             at = at[0] + shift[0] * scene.screen.pixel[0], at[1] + shift[1] * scene.screen.pixel[1]
+        halves = self._halves(scene, moved(scene.screen, *at))
+        image = mean_of(halves).image.cpu().numpy()
         return image, at, self._error(halves), float(image.sum())
 
     def _error(self, halves: list[Image]) -> float:
@@ -185,27 +191,36 @@ class Follower:
 
     def _halves(self, scene: Scene, screen: Screen) -> list[Image]:
         """Images on a screen of two independent halves of the rays."""
+        return list(self._images(scene, screen))
+
+    def _images(self, scene: Scene, screen: Screen) -> Iterator[Image]:
         one, heights = scene.onto(screen), self.heights.to(self.device)
-        rays = [sampler_for(one.batch(k, 2), max(1, self.rays // 2), stream(self.seed, f"day {k}"), self.device) for k in (0, 1)]
-        return [limited_to_source(expose(one, self.field, heights, half, requests=self.requests)) for half in rays]
+        for k in (0, 1):
+            rays = sampler_for(one.batch(k, 2), max(1, self.rays // 2), stream(self.seed, f"day {k}"), self.device)
+            yield limited_to_source(expose(one, self.field, heights, rays))
 
-    def _median(self, scene: Scene) -> tuple[float, float]:
-        """Median of the landing points along the screen's axes from its centre, mm; (0, 0) without light."""
+    def _landing(self, scene: Scene) -> Landing:
+        """Landing points of rays through the coarse surface."""
         rays = rays_of(scene, "stratified" if scene.source.parallel else "sobol", FINDING, stream(self.seed, "day"))
-        parts = list(landing_points(scene, self.field, self.heights.cpu(), rays, Misalignment(), self.requests))
-        power = torch.cat([p.power for p in parts])
-        if not float(power.sum()) > 0:
-            return 0.0, 0.0
-        x, y = (_median(torch.cat([getattr(p, name) for p in parts]), power) for name in ("x", "y"))
-        return x, y
+        return [(p.x, p.y, p.power) for p in landing_points(scene, *self._coarse, rays, Misalignment())]
 
 
-def _median(values: Tensor, weights: Tensor) -> float:
-    """The value below which half of the weight lies."""
-    lit = weights > 0
-    order = values[lit].argsort()
-    below = weights[lit][order].cumsum(0)
-    return float(values[lit][order][int(torch.searchsorted(below, 0.5 * below[-1]))])
+def _coarse(field: HeightField, heights: Tensor) -> tuple[HeightField, Tensor]:
+    """The surface without the detail that makes the picture, and its control heights."""
+    x, y = (torch.linspace(-r, r, COARSE, dtype=torch.float64) for r in field.half_size)
+    (z,) = field.at(heights.cpu(), x.repeat_interleave(COARSE), y.repeat(COARSE), [(0, 0)])
+    return HeightField.through(z.reshape(COARSE, COARSE).numpy(), field.half_size)
+
+
+def _median(landing: Landing) -> tuple[float, float]:
+    """Medians of x and y, mm, below which half of the power lands; 0 without light."""
+    x, y, power = (torch.cat(parts) for parts in zip(*landing, strict=True))
+    found = []
+    for values in (x, y):
+        order = torch.where(power > 0, values, torch.inf).argsort()
+        below = power[order].cumsum(0)
+        found.append(float(values[order][int(torch.searchsorted(below, 0.5 * below[-1]))]) if float(below[-1]) > 0 else 0.0)
+    return found[0], found[1]
 
 
 @dataclass(frozen=True)

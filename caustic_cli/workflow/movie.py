@@ -116,7 +116,7 @@ class Movie(NoMovie):
     def write(self) -> None:
         if self.frames:
             each = min(max(LENGTH // len(self.frames), LEAST), LONGEST)
-            shown = [captioned(enlarged(frame.codes), *frame.words) for frame in self.frames]
+            shown = [_drawn(frame) for frame in self.frames]
             movies.write_movie(self.path, shown, [*[each] * (len(shown) - 1), LAST])
 
     def _error(self, image: np.ndarray) -> float:
@@ -134,6 +134,11 @@ class Movie(NoMovie):
 def recorder(path: Path | None, force: bool) -> NoMovie:
     """The recording of a design at `path`, or none."""
     return NoMovie() if path is None else Movie(path, force)
+
+
+def _drawn(frame: Frame) -> Image.Image:
+    """A frame of a design."""
+    return captioned(enlarged(frame.codes), *frame.words)
 
 
 def enlarged(codes: np.ndarray) -> Image.Image:

@@ -77,7 +77,6 @@ class DayOfSunlight(Output):
             rays=rendering.asked.tracing.rays or study.RAYS,
             seed=rendering.seed,
             device=rendering.device,
-            requests=plan.requests,
         )
         with say.progress(None) as show:
             found, frames = study.follow_day(
