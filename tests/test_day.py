@@ -142,6 +142,7 @@ def test_render(project, monkeypatch, capfd, tmp_path):
     ("options", "words"),
     [
         (("--day", "tomorrow"), "a date like 2026-06-21"),
+        (("--day", "1066-10-14"), "1900 to 2099"),
         (("--day", DATE, "--screen-radius", "400"), "curved screen"),
         (("--day", DATE, "--cut", "a.gcode"), "--cut goes without --day"),
         (("--day", DATE, "--faces", "0"), "from behind"),

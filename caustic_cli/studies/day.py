@@ -9,7 +9,7 @@ Notation
     F_0, P_0    error and power on the picture under the light for which the lens is designed
     C           contrast of the target, its standard deviation over its mean: F of an even grey
     as designed F <= FACTOR F_0 + MORE after following
-    legible     F <= C / 2 after following: three quarters of the variance of the picture's pixels are the picture's
+    legible     F <= C / 2 after following, three quarters of the variance of its pixels being the picture's; or as designed
     on screen   legible, and at least PART of the power of the followed picture still lands on the screen where it stands
 
 Powers are those of a beam of constant irradiance across it, of which the pane receives the cosine of its incidence: air, which
@@ -132,8 +132,8 @@ class Follower:
     @property
     def bounds(self) -> tuple[float, float]:
         """The largest F of a picture as designed, and of a legible one."""
-        grey = self.target.sum(0) if self.target.ndim == 3 else self.target
-        return FACTOR * self.error + MORE, CONTRAST * float(grey.std() / grey.mean())
+        grey, as_designed = self.target.sum(0) if self.target.ndim == 3 else self.target, FACTOR * self.error + MORE
+        return as_designed, max(as_designed, CONTRAST * float(grey.std() / grey.mean()))
 
     @property
     def white(self) -> np.ndarray:
@@ -365,6 +365,7 @@ def write_plot(path: Path, day: Day) -> None:
     """Write a PNG: error, displacement and brightness over the time of day, legible periods shaded."""
     from matplotlib.dates import DateFormatter  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.ticker import NullFormatter  # noqa: PLC0415
 
     from caustic_cli.studies.report import COLOURS  # noqa: PLC0415
 
@@ -377,6 +378,8 @@ def write_plot(path: Path, day: Day) -> None:
     error.axhline(day.bounds[1], color="0.4", ls="--", lw=1.0, label=f"legible: {day.bounds[1]:.3f}")
     error.axhline(day.bounds[0], color="0.4", ls=":", lw=1.0, label=f"as designed: {day.bounds[0]:.3f}")
     error.set(ylabel="relative RMS error", yscale="log")
+    error.yaxis.set_major_formatter("{x:g}")
+    error.yaxis.set_minor_formatter(NullFormatter())
     for axis, colour in zip((0, 1), COLOURS[:2], strict=True):
         place.plot(times, [i.moved[axis] for i in day.instants], color=colour, label=f"along the screen's {'xy'[axis]}")
     place.set_ylabel("displacement (mm)")

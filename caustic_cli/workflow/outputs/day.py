@@ -12,7 +12,7 @@ from caustic_cli.config.optional import sunlight
 from caustic_cli.errors import InputError
 from caustic_cli.io.movie import write_movie
 from caustic_cli.io.picture import codes_of
-from caustic_cli.scene.sunlight import Hours, Sunlight
+from caustic_cli.scene.sunlight import Hours, Sunlight, moment
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies import day as study
 from caustic_cli.studies.retrace import white_level
@@ -56,6 +56,7 @@ class DayOfSunlight(Output):
             day = date.fromisoformat(self.day)
         except ValueError:
             raise InputError(f"⟨day⟩ must be a date like 2026-06-21, got {self.day!r}") from None
+        moment(f"{day}T12:00Z", "⟨day⟩")  # refuses years in which the sun is elsewhere
         lens = rendering.lens
         room = None if lens.project is None else lens.project.room(rendering.asked.tracing.given)
         if room is None:
@@ -102,7 +103,8 @@ def _frame(follower: study.Follower, encoding: str, seen: study.Seen) -> Image.I
     for image in (seen.around, seen.image):
         grey, xyz = separated(scene, study.smoothed(image, follower.rays))
         if scene.colored:
-            viewed, level = as_viewed(scene, grey, follower.target)
+            exposure = float(image.sum() / follower.white.sum())
+            viewed, level = as_viewed(scene, grey, exposure * follower.target)
         else:
             viewed, level = grey if xyz is None else in_colour(scene, xyz, white), white
         shown.append(enlarged(codes_of(viewed, level, encoding)))
