@@ -50,6 +50,7 @@ SCENES = {
     "mirror": replace(PLAIN, lens=replace(LENS, mirror=True), screen=replace(SCREEN, z=-100.0)),
     "entrance": replace(PLAIN, lens=replace(LENS, entrance=FRONT)),
     "sphere": replace(PLAIN, screen=replace(SCREEN, tilt=(10.0, 0.0), shift=(1.0, 2.0), radius=(60.0, math.inf))),
+    "turned": replace(PLAIN, screen=replace(SCREEN, tilt=(0.0, 20.0, 90.0)), source=Disc(angle=0.5, tilt=(0.0, 20.0))),
     "sag": replace(PLAIN, screen=replace(SCREEN, sags=Sags(np.zeros((8, 7)), (20.0, 16.0)))),
     "elements": replace(
         PLAIN,

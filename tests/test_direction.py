@@ -25,8 +25,9 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose, tracers
 from caustic_cli.optics.waves.image import wave_image
-from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
-from caustic_cli.scene.screen import tilted
+from caustic_cli.scene import Disc, Lens, PlaneWave, Scene, Screen
+from caustic_cli.scene.screen import tilt_to, tilted
+from caustic_cli.studies.independent_rays import sample_rays
 from caustic_cli.studies.metrics import relative_rms
 
 FILTER = Filter("cosine", (3, 3))
@@ -140,6 +141,75 @@ def test_start_by_transport(tilt, most):
     assert relative_rms(image, target * image.sum() / target.sum()) < most
 
 
+def turned(screen: Screen) -> tuple[Screen, Screen]:
+    """The same rectangle with its normal against the light, turned over about its x axis, and with its x axis along its y."""
+    x, y, z = screen.axes
+    over = replace(screen, tilt=tilt_to(x, (-z[0], -z[1], -z[2])))
+    return over, replace(screen, tilt=tilt_to(y, z), resolution=screen.resolution[::-1], size=screen.size[::-1])
+
+
+@pytest.mark.parametrize("kind", ["lines", "sobol"])
+@pytest.mark.parametrize("source", [PlaneWave(), PlaneWave(tilt=TILTS[1]), Disc(angle=2.0, tilt=TILTS[1])])
+def test_screens_in_any_plane(source, kind):
+    """An image is that of the same rectangle with other axes, reordered."""
+    lit = replace(scene(source.tilt), source=source)
+    field, z = HeightField.of(lit.lens), heights()
+    image, over, along = (
+        expose(one, field, z, rays_of(one, kind, 40_000), FILTER).image
+        for one in (lit, *(replace(lit, screen=screen) for screen in turned(lit.screen)))
+    )
+    for other in (over.flip(1), along.T.flip(0)):
+        torch.testing.assert_close(image, other, rtol=0, atol=1e-12 * float(image.max()))
+
+
+def test_wave_images_on_screens_in_any_plane():
+    lit = scene((20.0, 0.0), 300.0, 20.0, 48, size=(10.0, 10.0), z_in=0.0, control=(24, 24), degree=(3, 3))
+    lit = replace(lit, screen=replace(lit.screen, tilt=(5.0, 8.0)))
+    field = HeightField.of(lit.lens)
+    x, y = (c.numpy() for c in field.control_xy())
+    z = torch.from_numpy(5.0 - 0.001 * (x[:, None] ** 2 + y[None, :] ** 2))
+    image, over, along = (
+        wave_image(replace(lit, screen=screen), field, z, wavelengths=(550.0,)).image
+        for screen in (lit.screen, *turned(lit.screen))
+    )
+    for other in (over.flip(1), along.T.flip(0)):
+        assert float((image - other).norm()) < 0.02 * float(image.norm())
+
+
+def test_a_screen_along_the_light_is_refused():
+    lit = scene((40.0, 0.0))
+    with pytest.raises(InputError, match="parallel to the light"):
+        replace(lit, screen=replace(lit.screen, tilt=(-50.0, 0.0)))
+
+
+@pytest.mark.parametrize("angles", [(10.0, 20.0, 30.0), (-80.0, 170.0, 5.0), (90.0, 0.0, 30.0), (-90.0, 0.0, -140.0)])
+def test_rotations_to_axes(angles):
+    x, _, z = tilted(angles)
+    assert tilt_to(x, z) == pytest.approx(angles, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        Disc(angle=0.5333, tilt=(30.0, 20.0)),
+        Disc(angle=40.0, tilt=(-30.0, 25.0)),
+        Disc(angle=30.0, tilt=(40.0, -20.0), brightness=np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 5.0]])),
+    ],
+)
+def test_a_tilted_disc_lights_the_aperture_by_the_cosine(source):
+    """Moments of the directions against rays weighted one by one."""
+    lit = replace(scene((0.0, 0.0)), source=source)
+    drawn = [state.expanded() for state in rays_of(lit, "sobol", 1 << 17).chunks()]
+    d = np.concatenate([torch.stack(state.full(state.direction)).numpy() for state in drawn], 1)
+    power = np.concatenate([state.power.numpy() for state in drawn])
+    assert power.sum() == pytest.approx(1.0, abs=1e-12) and np.abs(np.linalg.norm(d, axis=0) - 1.0).max() < 1e-12
+    (_, other, weight), *_ = sample_rays(lit, 1 << 20, np.random.default_rng(0))
+    for i, j in ((0, 0), (1, 1), (0, 1), (2, 2), (0, 2), (1, 2)):
+        value = weight * other[i] * other[j]
+        noise = value.std() / math.sqrt(len(weight)) + 2e-6
+        assert (power * d[i] * d[j]).sum() == pytest.approx(value.mean(), abs=4.0 * noise)
+
+
 def test_light_inside_obeys_snells_law():
     d = tilted((35.0, -20.0))[2]
     kx, ky = slopes_inside(d, 1.5)
@@ -187,6 +257,9 @@ def test_design_and_render(in_tmp, capfd):
         (("--source-tilt", "20,0", "--array", "2"), "one lens with a flat entrance"),
         (("--source-tilt", "20,0", "--robust", "t.toml"), "--robust"),
         (("--source-tilt", "20,0", "--source", "point"), "tilt"),
+        (("--source-tilt", "20,0", "--source", "disc"), "disc with an angle"),
+        (("--screen-tilt", "1,2,3,4"), "two or three angles"),
+        (("--screen-tilt", "90,0"), "parallel to the light"),
         (("--source-tilt", "75,0", "--thickness", "30"), "sides"),
         (("--source-tilt", "nan,0"), "tilt"),
     ],

@@ -268,7 +268,7 @@ def test_rounds_of_a_wave_image(monkeypatch):
         ({"lens_roughness": 2.0}, "[lens] roughness must be 0 to 1, got 2"),
         ({"source_weights": [1.0]}, "[source] weights must be one for each of the 0 wavelengths, got 1"),
         ({"source_polarisation": 1e9}, "[source] polarisation must be -360 to 360"),
-        ({"screen_tilt": [90.0, 0.0]}, "[screen] tilt must be -85 to 85, got 90"),
+        ({"screen_tilt": [190.0, 0.0]}, "[screen] tilt must be -180 to 180, got 190"),
         ({"target_color": True, "source_wavelengths": [500.0]}, "[source] wavelengths of a coloured picture are three"),
     ],
 )

@@ -300,9 +300,9 @@ def test_the_image_of_the_source_through_a_point_of_the_lens(kind, tilt):
         off = []
         for image in images:
             (hx, hy), (a, b) = image.half, image.skew
-            sign = np.sign(np.diag(ray))
-            off.append(np.linalg.norm(ray - np.array([[hx, a * hy], [b * hx, hy]]) * sign, 2) / np.linalg.norm(ray, 2))
-        assert min(off) < 0.06
+            ellipse = np.array([[hx, a * hy], [b * hx, hy]])  # up to a rotation of the source, if that is round
+            off.append(np.linalg.norm(ray @ ray.T - ellipse @ ellipse.T, 2) / np.linalg.norm(ray @ ray.T, 2))
+        assert min(off) < 0.12
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (30.0, 0.0), (-20.0, 40.0)])

@@ -27,18 +27,18 @@ GROUPS = {
 }
 #: Groups of options that do not follow from a section, by option name.
 PLACED = {
-    **dict.fromkeys(("mag", "margin", "invert"), "Picture"),
+    **dict.fromkeys(("mag", "picture_size", "margin", "invert"), "Picture"),
     "element": "Lens",
-    **dict.fromkeys(("throw", "screen_size", "resolution", "screen_at"), "Screen"),
+    **dict.fromkeys(("throw", "screen", "screen_size", "resolution", "screen_at"), "Screen"),
     **dict.fromkeys(("quality", "rays", "config", "preset", "plan", "error", "resume", "robust"), "Design"),
     **dict.fromkeys(("absorption", "roughness", "polarisation", "wavelengths", "waves", "effects", "explain"), "Effects"),
     **dict.fromkeys(("tolerance", "reconstruction", "filter_size", "alpha"), "Image"),
 }
 #: Synonyms of options.
 SYNONYMS = {
-    **dict.fromkeys(("--magnification", "--magnify", "--scale", "--picture-size"), "--mag"),
+    **dict.fromkeys(("--magnification", "--magnify", "--scale"), "--mag"),
     **dict.fromkeys(("--size", "--width", "--lens", "--lens-width", "--plate"), "--lens-size"),
-    **dict.fromkeys(("--distance", "--screen", "--screen-distance", "--focal-length", "--wall", "--z"), "--throw"),
+    **dict.fromkeys(("--distance", "--screen-distance", "--focal-length", "--wall", "--z"), "--throw"),
     **dict.fromkeys(("--material", "--plastic"), "--glass"),
     **dict.fromkeys(("--refractive-index", "--ior", "--n"), "--index"),
     **dict.fromkeys(("--pixels", "--res"), "--resolution"),

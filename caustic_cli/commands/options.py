@@ -319,6 +319,16 @@ def _sun(option: str, text: str) -> dict[str, Any]:
     return {"room.place": list(place), "room.time": time.strip()}
 
 
+def _place(option: str, text: str) -> str:
+    """A part of a room, its distance in mm: "floor:1m" is "floor:1000"."""
+    name, colon, rest = text.strip().partition(":")
+    if not colon:
+        return name
+    distance, comma, azimuth = rest.partition(",")
+    form = "a part of a room and its distance like floor:1000, wall:2m or wall:2000,90"
+    return f"{name}:{numbers(option, distance, (1,), form=form, unit='mm')[0]:.15g}{comma}{azimuth}"
+
+
 def _radius(option: str, text: str) -> dict[str, Any]:
     """Radii of a screen: "60" for a sphere; "60,inf" or "inf,60" for a cylinder."""
     form = "one number of mm, or two with inf for straight, like 60, 60,inf or -8cm"
@@ -381,9 +391,12 @@ READERS = {
     "source.power": _power,
     "source.wavelengths": _spectrum,
     "screen.radius": _radius,
+    "screen.tilt": lambda option, text: {"screen.tilt": list(numbers(option, text, (2, 3), ",", "two or three angles like 20,0"))},
     "room.place": _sun,
     "rays": lambda option, text: {"rays": rays(option, text)},
+    "screen_place": lambda option, text: {"screen_place": _place(option, text)},
     "screen_size": lambda option, text: {"screen_size": size(option, text)},
+    "picture_size": lambda option, text: {"picture_size": size(option, text)},
     "resolution": lambda option, text: {"resolution": counts(option, text)},
 }
 #: Help of options that are more restricted than their setting.

@@ -6,6 +6,7 @@ Each function completes its own part of the settings, if present, for `completio
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
@@ -14,11 +15,14 @@ from caustic_cli.errors import InputError, alternatives
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.loading import OnDemand
 from caustic_cli.scene import sources
+from caustic_cli.scene.interaction import interaction_of
 from caustic_cli.scene.traits import TRAITS
 from caustic_cli.schema.table import (
     DesignSettings,
     ElementSettings,
+    Parameters,
     RoomSettings,
+    ScreenSettings,
     SecondSettings,
     SourceSettings,
     check,
@@ -26,6 +30,7 @@ from caustic_cli.schema.table import (
 )
 
 rooms, sunlights = OnDemand("caustic_cli.scene.room"), OnDemand("caustic_cli.scene.sunlight")
+room_screens = OnDemand("caustic_cli.scene.room_screen")
 
 #: Decimals of the angles that follow from a time, degrees, and how far a project's own may be from them.
 ANGLE_DECIMALS, SAME_ANGLE = 4, 0.01
@@ -71,6 +76,37 @@ def complete_sunlight(source: SourceSettings, room: RoomSettings | None) -> Sour
         )
     width = {"angle": round(light.sun(time).diameter, ANGLE_DECIMALS)} if "angle" in type.keys else {}
     return source.filled(tilt=tilt, **width)
+
+
+def lit_by_sun(room: RoomSettings | None, by: Parameters) -> RoomSettings | None:
+    """The room, None where it has no sun and only gives the screen its place."""
+    dark = room is not None and room.place is None and room.time is None and by.screen_place is not None
+    return None if dark else room
+
+
+def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping[str, Any]) -> ScreenSettings:
+    """The screen in its place in the room; without one, square to light that is tilted and centred on it, where its own tilt and
+    shift are not given.
+
+    room, given: the sections [room] and [screen] as given.
+
+    Raises:
+        InputError: the place is not reached by the light, or the screen has two.
+    """
+    interaction, source = interaction_of(s.lens.mirror), build_source(s.source)
+    if by.screen_place is None:
+        if not source.oblique:
+            return s.screen
+        x, y, z = (abs(s.screen.z) / source.axis[2] * c for c in source.axis)
+        return s.screen.filled(tilt=[interaction.side * angle for angle in source.tilt], shift=[x, y])
+    twice = ["⟨throw⟩"] * (by.throw is not None) + [f"⟨screen.{key}⟩" for key in ("z", "tilt", "shift") if key in given]
+    if twice or s.elements:
+        why = f"{twice[0]} would be another" if twice else "⟨element⟩ has the screen on its own axis"
+        raise InputError(f"⟨screen_place⟩ gives the screen its distance, tilt and shift: {why}")
+    x, y, z = source.axis if source.distant else (-c / math.hypot(*source.centre) for c in source.centre)
+    pane = rooms.Room() if room is None else rooms.Room(room.faces, room.slope)
+    place = room_screens.placed(by.screen_place, pane, interaction.sent((x, y, z)), interaction.side)
+    return s.screen.changed(z=place.z, tilt=place.tilt, shift=place.shift)
 
 
 def middle_distance(over: Ranges, z: float, side: float, given: bool) -> float:

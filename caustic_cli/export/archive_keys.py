@@ -54,6 +54,7 @@ KEYS: dict[str, tuple[Key, ...]] = {
         Key("z_screen", "", "mm", "position of its centre", True),
         Key("resolution", "(2,)", "whole", "pixels along x and y", True),
         Key("screen_tilt", "(2,)", "degrees", "rotations about x, then about y; only if not 0"),
+        Key("screen_turn", "", "degrees", "rotation about its normal, before its tilt; only if not 0"),
         Key("screen_shift", "(2,)", "mm", "decentre along x and y; only if not 0"),
         Key("screen_curvature", "(2,)", "1/mm", "along x and y, 0 along a cylinder; only of a sphere or a cylinder"),
         Key("screen_sag", "(a, b)", "mm", "heights along its normal on a regular grid, borders included; only of a measured shape"),
@@ -66,7 +67,7 @@ KEYS: dict[str, tuple[Key, ...]] = {
         Key("source_power", "(k,)", "W or lm", "of each point; k = 1 for all others, of which those at infinity have it through"
             " the aperture"),
         Key("cone_half_angle", "", "degrees", "half angle of the emission, 0 for a plane wave"),
-        Key("source_tilt", "(2,)", "degrees", "rotations of +z about x, then y, to its light; only of a tilted plane wave"),
+        Key("source_tilt", "(2,)", "degrees", "rotations of +z about x, then y, to the axis of light from infinity; only if not 0"),
         Key("source_profile", "(a, b)", "1", "relative irradiance over the aperture; only of a plane wave that is not uniform"),
         Key("source_size", "(2,)", "mm", "full widths of a disc at a finite distance"),
         Key("source_angle", "", "degrees", "angular diameter of a disc at infinity"),

@@ -232,10 +232,12 @@ def _elements(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _screen(screen: Screen) -> dict[str, np.ndarray]:
-    """Optional keys of the screen: `screen_tilt` (2,), degrees, `screen_shift` (2,), mm, and of a curved one
+    """Optional keys of the screen: `screen_tilt` (2,) and `screen_turn`, degrees, `screen_shift` (2,), mm, and of a curved one
     `screen_curvature` (2,), 1/mm along x and y, 0 along a cylinder, or `screen_sag` (a, b), mm along its normal, [i, j] on a
     regular grid over `screen_sag_half_size` (2,), mm about its centre."""
-    found = {f"screen_{key}": _reals(getattr(screen, key)) for key in ("tilt", "shift") if any(getattr(screen, key))}
+    (*tilt, turn), shift = (*screen.tilt, 0.0)[:3], screen.shift
+    found = {key: _reals(value) for key, value in (("tilt", tilt), ("turn", turn), ("shift", shift)) if np.any(value)}
+    found = {f"screen_{key}": value for key, value in found.items()}
     if screen.rounded:
         found["screen_curvature"] = 1.0 / _reals(screen.radius)
     if screen.sags is not None:
@@ -282,8 +284,12 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
 
 def _of_plane(scene: Scene) -> dict[str, np.ndarray]:
     wave = scene.source
-    tilt = {"source_tilt": _reals(wave.tilt)} if any(wave.tilt) else {}
-    return {"cone_half_angle": _reals(0.0)} | ({} if wave.profile is None else {"source_profile": _reals(wave.profile)}) | tilt
+    profile = {} if wave.profile is None else {"source_profile": _reals(wave.profile)}
+    return {"cone_half_angle": _reals(0.0)} | profile | _tilt(wave)
+
+
+def _tilt(source: Source) -> dict[str, np.ndarray]:
+    return {"source_tilt": _reals(source.tilt)} if source.oblique else {}
 
 
 def _of_points(scene: Scene) -> dict[str, np.ndarray]:
@@ -303,7 +309,7 @@ def _of_disc(scene: Scene) -> dict[str, np.ndarray]:
     source = scene.source
     light = {} if source.brightness is None else {"source_brightness": _reals(source.brightness)}
     if source.distant:
-        return {"cone_half_angle": _reals(source.angle / 2.0), "source_angle": _reals(source.angle)} | light
+        return {"cone_half_angle": _reals(source.angle / 2.0), "source_angle": _reals(source.angle)} | light | _tilt(source)
     return _of_points(scene) | {"source_size": _reals(source.size)} | light
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -255,7 +255,7 @@ def _camera(screen: Screen, away: float, place: str, depth: int = DEPTH) -> list
 def _screen(screen: Screen, spin: str, onto: str = "") -> list[str]:
     """White rectangle facing +z, or -z with `spin`, tilted about its centre; onto: transformation to a folded axis."""
     sx, sy = screen.half_size
-    leaning = "".join(f'<rotate {axis}="1" angle="{real(t)}"/>' for axis, t in zip("xy", screen.tilt, strict=True) if t)
+    leaning = "".join(f'<rotate {axis}="1" angle="{real(t)}"/>' for axis, t in _turns(screen.tilt) if t)
     return [
         '<shape type="rectangle" id="screen">',
         '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
@@ -263,6 +263,11 @@ def _screen(screen: Screen, spin: str, onto: str = "") -> list[str]:
         "</transform>",
         "</shape>",
     ]
+
+
+def _turns(tilt: Sequence[float]) -> list[tuple[str, float]]:
+    """The rotations of `scene.screen.tilted` in their order, axes and degrees."""
+    return [*zip("z", tilt[2:], strict=False), *zip("xy", tilt, strict=False)]
 
 
 def _moved(screen: Screen, z: float) -> str:

@@ -22,7 +22,7 @@ from torch import Tensor
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident, lit_rectangle
-from caustic_cli.inverse.projection import BeamProjection, ScreenProjection
+from caustic_cli.inverse.projection import BeamProjection, ScreenProjection, seen_by_light
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
@@ -266,6 +266,7 @@ def first_surface(
         InputError: the picture cannot be reached by refraction.
     """
     began = time.monotonic()
+    scene, target = seen_by_light(scene, target)
     times, options = _refinement(cells, target) if scene.source.distant else 1, {}
     cells = min(cells, SOLVED * times)
     if times > 1:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -30,7 +30,8 @@ from scipy.ndimage import map_coordinates
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.screen_shape import points_in_space, shape_of
-from caustic_cli.scene import Screen
+from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene.screen import tilt_to
 
 #: Cells of the plane per pixel along each axis: with 1 the picture is blurred, and the initial error on a sphere 0.28, not 0.24.
 FINER = 2
@@ -179,6 +180,38 @@ class BeamProjection(ScreenProjection):
         a, b = u / self.distance, v / self.distance
         along = np.sqrt(np.maximum(1.0 - a * a - b * b, 0.0))
         return np.stack([a, b, self.forward * along]).reshape(3, -1)
+
+
+def seen_by_light(scene: Scene, target: np.ndarray) -> tuple[Scene, np.ndarray]:
+    """The scene with its screen's axes exchanged and reversed such that the light sees them along x and y of the lens, as nearly as
+    may be, and the target (n_x, n_y) on its pixels; unchanged where they are, or on a curved screen or a folded axis."""
+    screen, side = scene.screen, scene.lens.interaction.side
+    if screen.curved or screen.windows or scene.elements:
+        return scene, target
+    light, axes = np.array(scene.undeviated), np.array(screen.axes)
+    normal = axes[2] if side * (axes[2] @ light) > 0 else -axes[2]
+    seen = axes - np.outer(axes @ light, light)
+
+    def alike(choice: tuple[int, int, int]) -> float:
+        first, a, b = choice
+        return a * float(seen[first][0]) + b * float(seen[1 - first][1])
+
+    choices = [(k, a, b) for k in (0, 1) for a in (1, -1) for b in (1, -1)]
+    right = [(k, a, b) for k, a, b in choices if np.cross(a * axes[k], b * axes[1 - k]) @ normal > 0]
+    best = max(right, key=alike)
+    if best == (0, 1, 1):
+        return scene, target
+    first, a, b = best
+    across = (float(c) for c in a * axes[first])
+    pair = (lambda values: values[::-1]) if first else (lambda values: values)
+    turned = replace(
+        screen,
+        tilt=tilt_to((next(across), next(across), next(across)), (float(normal[0]), float(normal[1]), float(normal[2]))),
+        size=pair(screen.size),
+        resolution=pair(screen.resolution),
+    )
+    target = target.T if first else target
+    return replace(scene, screen=turned), np.ascontiguousarray(target[::a, ::b])
 
 
 def _tensor(value):

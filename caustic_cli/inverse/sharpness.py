@@ -114,7 +114,7 @@ def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spr
         """Whether a magnification is accepted and can be reached by a lens of this width onto a screen at z."""
         wider = width / lens.size[0]
         sized = replace(lens, size=(wider * lens.size[0], wider * lens.size[1]))
-        other = replace(scene, source=PlaneWave(), lens=sized, screen=replace(scene.screen, z=z))
+        other = replace(scene, source=PlaneWave(tilt=scene.source.tilt), lens=sized, screen=replace(scene.screen, z=z))
         most = largest_magnification(other, [wider * wanted / mag * p for p in picture])
         return TABLE["mag"].low <= wanted <= TABLE["mag"].high and (most is None or most >= wanted)
 

@@ -42,7 +42,7 @@ CONVOLUTION = Capability(
     "design by convolution with the source",
     {
         "separate places": "its places have images of their own",
-        **dict.fromkeys(("tilted screen", "curved screen"), "the image of the source varies over the screen"),
+        "curved screen": "the image of the source varies over the screen",
         **dict.fromkeys(("other elements", "folded axis"), "the blur by the lens alone is not that on the screen"),
     },
 )
@@ -168,7 +168,7 @@ def etendue_limit(scene: Scene) -> float | None:
     x, y, cell = _area(lens.half_size, lens.opening)
     area = cell * len(x)
     if source.distant:
-        given = area * math.pi * math.sin(source.half_angle) ** 2
+        given = area * math.pi * math.sin(source.half_angle) ** 2 * source.axis[2]
     elif min(source.extent) > 0 and len(source.points()[0]) == 1:
         a, b, part = _area(source.extent, CircularAperture())
         x0, y0, z0 = source.points()[0][0]

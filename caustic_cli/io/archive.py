@@ -164,15 +164,20 @@ def _screen(data: Archive) -> Screen:
         tuple(2.0 * h for h in data.reals("screen_half_size", 2).tolist()),
         data.real("z_screen"),
         data.wholes("resolution", 2),
-        *(tuple(data.reals(f"screen_{key}", 2).tolist()) if f"screen_{key}" in data else (0.0, 0.0) for key in ("tilt", "shift")),
+        (*_pair(data, "screen_tilt"), *((data.real("screen_turn"),) if "screen_turn" in data else ())),
+        _pair(data, "screen_shift"),
         _radius(data),
         sags,
     )
 
 
+def _pair(data: Archive, key: str) -> tuple[float, float]:
+    a, b = data.reals(key, 2).tolist() if key in data else (0.0, 0.0)
+    return a, b
+
+
 def _radius(data: Archive) -> tuple[float, float]:
-    curvature = data.reals("screen_curvature", 2).tolist() if "screen_curvature" in data else [0.0, 0.0]
-    x, y = (1.0 / k if k else math.inf for k in curvature)
+    x, y = (1.0 / k if k else math.inf for k in _pair(data, "screen_curvature"))
     return x, y
 
 
@@ -220,8 +225,7 @@ def _measured(data: Archive, rays: RaySet | None) -> Measured:
 
 
 def _plane(data: Archive) -> PlaneWave:
-    a, b = data.reals("source_tilt", 2).tolist() if "source_tilt" in data else (0.0, 0.0)
-    return PlaneWave(_power(data), _picture(data, "source_profile"), (a, b))
+    return PlaneWave(_power(data), _picture(data, "source_profile"), _pair(data, "source_tilt"))
 
 
 def _points(data: Archive) -> Points:
@@ -232,7 +236,7 @@ def _points(data: Archive) -> Points:
 def _disc(data: Archive) -> Disc:
     brightness = _picture(data, "source_brightness")
     if "source_angle" in data:
-        return Disc(power=_power(data), angle=data.real("source_angle"), brightness=brightness)
+        return Disc(power=_power(data), angle=data.real("source_angle"), brightness=brightness, tilt=_pair(data, "source_tilt"))
     size = tuple(data.reals("source_size", 2).tolist())
     return Disc(_positions(data)[0], size, _power(data), brightness=brightness, **_shining(data))
 

@@ -21,11 +21,11 @@ Axes = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float
 
 @dataclass(frozen=True)
 class Pose:
-    """Position and orientation of an element: its origin, mm, and right-handed rotations first about x, then about y, degrees,
-    relative to the axes `frame`."""
+    """Position and orientation of an element: its origin, mm, and right-handed rotations relative to the axes `frame`,
+    degrees, see `scene.screen.tilted`."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    tilt: tuple[float, float] = (0.0, 0.0)
+    tilt: tuple[float, ...] = (0.0, 0.0)
     frame: Axes = IDENTITY
 
     @cached_property

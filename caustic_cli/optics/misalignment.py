@@ -80,7 +80,7 @@ class Misalignment:
     def screen(self, scene: Scene) -> tuple[tuple[float, float, float], tuple]:
         """Centre, mm, and axes of the screen in the frame of the lens."""
         s, pose = scene.screen, self.lens_pose(scene)
-        tilt = (s.tilt[0] + self.screen_tilt[0], s.tilt[1] + self.screen_tilt[1])
+        tilt = (s.tilt[0] + self.screen_tilt[0], s.tilt[1] + self.screen_tilt[1], *s.tilt[2:])
         centre = (s.shift[0] + self.screen_shift[0], s.shift[1] + self.screen_shift[1], s.z + self.throw)
         axes = tuple(rotate_to_local(pose, s.in_space(axis)) for axis in Pose(tilt=tilt).axes)
         return self.point(scene, s.in_space(centre)), axes

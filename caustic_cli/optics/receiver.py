@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -121,10 +122,13 @@ class Receiver:
 
     @cached_property
     def plane(self) -> NormalPlane:
-        """The plane through its centre normal to the axis; its own plane if that is normal to the axis."""
-        (u, _, n), axis = self.axes, self.axis
+        """The plane through its centre normal to the axis, with e1 along the screen's x before a rotation about its normal; its own
+        plane and axes if it is `across`."""
+        (u, v, n), axis = self.axes, self.axis
         if self.across:
             return NormalPlane(self.axes, dot(self.middle, n), self.screen.windows)
+        turn = math.radians(sum(self.screen.tilt[2:]))
+        u = cast(Vector, tuple(math.cos(turn) * a - math.sin(turn) * b for a, b in zip(u, v, strict=True)))
         x, y, z = (a - dot(u, axis) * b for a, b in zip(u, axis, strict=True))
         size = math.sqrt(dot((x, y, z), (x, y, z)))
         e1 = (x / size, y / size, z / size)
@@ -133,8 +137,8 @@ class Receiver:
 
     @property
     def across(self) -> bool:
-        """Whether it is perpendicular to the axis."""
-        return abs(dot(self.axes[2], self.axis)) >= ACROSS
+        """Whether it is perpendicular to the axis, and not rotated about that."""
+        return abs(dot(self.axes[2], self.axis)) >= ACROSS and not any(self.screen.tilt[2:])
 
     def corners(self) -> list[Vector]:
         """Its four corners in space, mm."""

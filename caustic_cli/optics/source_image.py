@@ -18,6 +18,7 @@ import math
 
 import numpy as np
 
+from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.screen_shape import normals, points_in_space
 from caustic_cli.optics.spread import Spread
 from caustic_cli.scene import Scene
@@ -60,7 +61,7 @@ def source_images(scene: Scene, middle: bool = False) -> list[Spread]:
     )
     while len(distinct := _distinct(matrices, alike)) > MOST:
         alike *= COARSER
-    return [_spread(scene, matrix) for matrix in distinct]
+    return [Spread.of(source, matrix) for matrix in distinct]
 
 
 def _distinct(matrices: list[np.ndarray], alike: float) -> list[np.ndarray]:
@@ -70,20 +71,6 @@ def _distinct(matrices: list[np.ndarray], alike: float) -> list[np.ndarray]:
         if all(np.linalg.norm(matrix - m, 2) > alike * np.linalg.norm(m, 2) for m in found):
             found.append(matrix)
     return found
-
-
-def _spread(scene: Scene, matrix: np.ndarray) -> Spread:
-    """The point-spread function of a source for a matrix M."""
-    source, (sx, sy) = scene.source, np.diag(matrix)
-    skew = float(matrix[0, 1] / sy), float(matrix[1, 0] / sx)
-    frame = float(sx * source.frame[0]), float(sy * source.frame[1])
-    if source.distant:
-        sine = math.sin(source.half_angle)
-        return Spread((abs(float(sx)) * sine, abs(float(sy)) * sine), ((0.0, 0.0, 1.0),), 0.0, 0.0, source.brightness, frame, skew)
-    (ex, ey), (at, parts) = source.extent, source.points()
-    moved = (at[:, :2] - np.array(source.centre[:2])) * (sx, sy)
-    places = tuple((float(x), float(y), float(part)) for (x, y), part in zip(moved, parts, strict=True))
-    return Spread((abs(float(sx)) * ex, abs(float(sy)) * ey), places, 0.0, 0.0, source.brightness, frame, skew)
 
 
 def _matrices(scene: Scene, through: np.ndarray, onto: np.ndarray) -> np.ndarray:
@@ -127,7 +114,8 @@ def _arriving(scene: Scene, exit: np.ndarray, moved: tuple[float, float]) -> np.
     lens, source = scene.lens, scene.source
     n = lens.inside
     if source.distant:
-        p, q = (m / n for m in moved)
+        length = math.sqrt(1.0 - moved[0] ** 2 - moved[1] ** 2)
+        p, q = (length * m / n for m in turned_about(source.axis, *(m / length for m in moved))[:2])
         return np.array([p, q, math.sqrt(1.0 - p * p - q * q)]) + 0.0 * exit
     d = exit[..., :2] - np.array(source.centre[:2]) - np.array(moved)
     entrance = lens.interaction.entered(lens.z_in, exit[..., 2])

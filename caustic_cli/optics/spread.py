@@ -19,11 +19,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from caustic_cli.optics.emission.base import Illuminated
-from caustic_cli.optics.emission.coherent import Mode, central_mode, outermost_modes
+from caustic_cli.optics.emission.coherent import Mode, central_mode, offset, outermost_modes
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, Source
 
 #: Quantile of the deviation that `usual` is.
 MOST = 0.8
@@ -59,6 +59,31 @@ class Spread:
     frame: tuple[float, float] = (0.0, 0.0)
     #: Of an image that is sheared (a, b): a point (x, y) of the image as given by the other fields lies at (x + a y, y + b x).
     skew: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of(cls, source: Source, by: np.ndarray, error: float = 0.0, usual: float = 0.0) -> Spread:
+        """That of a source whose points land displaced by the matrix `by`, (2, 2): mm per mm, or per direction sine."""
+        frame, half = source.frame, [math.sin(source.half_angle)] * 2 if source.distant else source.extent
+        if source.even and half[0] == half[1]:  # a round source looks the same turned: without the rotation, in polar decomposition
+            u, s, _ = np.linalg.svd(by)
+            by = (u * s) @ u.T
+        sx, sy = (float(c) for c in np.diag(by))
+        skew = tuple(float(by[i, 1 - i]) / s if s else 0.0 for i, s in ((0, sy), (1, sx)))
+        places: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 1.0),)
+        if not source.distant:
+            places = tuple(
+                (sx * (x - source.centre[0]), sy * (y - source.centre[1]), float(part))
+                for (x, y), part in zip(source.points()[0][:, :2].tolist(), source.points()[1], strict=True)
+            )
+        return cls(
+            (abs(sx) * half[0], abs(sy) * half[1]),
+            places,
+            error,
+            usual,
+            source.brightness,
+            (sx * frame[0], sy * frame[1]),
+            (skew[0], skew[1]),
+        )
 
     def reach(self) -> tuple[float, float]:
         """Radius of the point-spread function along x and y, mm."""
@@ -243,26 +268,11 @@ def spread_of(lit: Illuminated, landing: Landing, device: str | torch.device = "
             return None
         moved.append([(to_x - x)[lit_too], (to_y - y)[lit_too]])
     # Shift per displacement of the source point, from the outermost points along each axis, and the deviation from linearity.
-    slope = []
+    by = np.zeros((2, 2))
+    at = [offset(source, mode.position) for mode in outer]
     for k in (0, 1):
-        (up, down), (high, low) = outer[2 * k : 2 * k + 2], moved[2 * k : 2 * k + 2]
-        apart = up.position[k] - down.position[k]
-        slope.append(float(high[k].mean() - low[k].mean()) / apart if apart else 0.0)
-    off = torch.cat(
-        [
-            torch.hypot(*(m[k] - slope[k] * (mode.position[k] - centre.position[k]) for k in (0, 1)))
-            for mode, m in zip(outer, moved, strict=True)
-        ]
-    )
-    error, usual = float(off.max()), float(torch.quantile(off, MOST))
-    sx, sy = slope
-    frame = sx * source.frame[0], sy * source.frame[1]
-    if source.distant:
-        sine = math.sin(source.half_angle)
-        return Spread((abs(sx) * sine, abs(sy) * sine), ((0.0, 0.0, 1.0),), error, usual, source.brightness, frame)
-    places = tuple(
-        (float(slope[0] * (p[0] - centre.position[0])), float(slope[1] * (p[1] - centre.position[1])), float(part))
-        for p, part in zip(*source.points(), strict=True)
-    )
-    ex, ey = source.extent
-    return Spread((abs(sx) * ex, abs(sy) * ey), places, error, usual, source.brightness, frame)
+        (up, down), (high, low) = at[2 * k : 2 * k + 2], moved[2 * k : 2 * k + 2]
+        apart = up[k] - down[k]
+        by[:, k] = [float(high[i].mean() - low[i].mean()) / apart if apart else 0.0 for i in (0, 1)]
+    off = torch.cat([torch.hypot(*(m[i] - by[i] @ p for i in (0, 1))) for p, m in zip(at, moved, strict=True)])
+    return Spread.of(source, by, float(off.max()), float(torch.quantile(off, MOST)))

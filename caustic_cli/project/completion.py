@@ -20,8 +20,10 @@ from caustic_cli.config.optional import (
     complete_second_size,
     complete_sunlight,
     default_magnification,
+    lit_by_sun,
     middle_distance,
     middle_source,
+    stand,
 )
 from caustic_cli.config.settings import Given, Settings, build_screen, build_source, index_of
 from caustic_cli.errors import InputError
@@ -55,6 +57,7 @@ def complete(
         InputError: a value is out of range, or two contradict each other.
     """
     s, by = Settings.of(given), by or Parameters()
+    room, s = s.room, s.changed(room=lit_by_sun(s.room, by))
     s = s.changed(source=complete_sunlight(s.source, s.room))
     refuse_contradictions(s)
     if s.target.sheet:
@@ -71,7 +74,7 @@ def complete(
         s = s.changed(source=at, design=complete_network(s.design))
     if over or relative_to_initial(s.design):
         s = s.changed(design=s.design if "initial" in given.get("design", {}) else s.design.changed(initial="zero-last"))
-    s = s.changed(screen=facing(s), second=complete_second(s))
+    s = s.changed(second=complete_second(s), screen=stand(s, by, room, given.get("screen", {})))
     s = s.changed(target=complete_target(s, by, aspect))
     s = s.changed(screen=complete_screen(s.screen, s.target, by))
     s = s.changed(second=complete_second_size(s))
@@ -139,18 +142,13 @@ def complete_source(
     return source.without(*{*SourceSettings.of({})}.difference(sources.COMMON, *(type.keys for type in types)))
 
 
-def facing(s: Settings) -> ScreenSettings:
-    """The screen, square to light that is tilted and centred on it, where its own tilt and shift are not given."""
-    tilt = s.source.tilt
-    if tilt is None or not any(tilt):
-        return s.screen
-    side, (dx, dy, dz) = interaction_of(s.lens.mirror).side, build_source(s.source).axis
-    reach = abs(s.screen.z) / dz
-    return s.screen.filled(tilt=[side * angle for angle in tilt], shift=[reach * dx, reach * dy])
-
-
 def complete_target(s: Settings, by: Parameters, aspect: float) -> TargetSettings:
     """The target with its size on the screen."""
+    if by.picture_size is not None:
+        if "mag" in by:
+            raise InputError("⟨picture_size⟩ and ⟨mag⟩ both give the picture's size: give one of them")
+        width, height = (*by.picture_size, by.picture_size[0] * aspect)[:2]
+        return s.target.changed(size=(width, height))
     if "size" in s.target and "mag" not in by:
         return s.target
     if "size" in s.screen and "mag" not in by:

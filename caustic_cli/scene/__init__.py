@@ -25,7 +25,7 @@ from caustic_cli.scene.freeform import FreeForm, SecondTarget
 from caustic_cli.scene.lens import Lens, Offset
 from caustic_cli.scene.light import Light
 from caustic_cli.scene.materials import nearest_index, refractive_index
-from caustic_cli.scene.screen import Screen
+from caustic_cli.scene.screen import Screen, Vector
 from caustic_cli.scene.sources import PlaneWave, Source
 
 if TYPE_CHECKING:
@@ -93,6 +93,7 @@ class Scene:
             self.second_target.check(self.screen)
         self.lens.interaction.check_screen(self.screen.z, self.lens.z_in)
         self.screen.check_curvature()
+        self.screen.check_facing(self.undeviated)
         if self.source.nearest >= self.lens.z_in:
             raise InputError(
                 f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
@@ -102,6 +103,13 @@ class Scene:
             for wavelength in self.light.wavelengths:
                 for glass in self.glasses:
                     refractive_index(glass, wavelength)
+
+    @property
+    def undeviated(self) -> Vector:
+        """Unit direction, in the frame of the screen, of light along the source's axis behind a surface without slopes."""
+        if self.elements or not self.source.distant:
+            return 0.0, 0.0, float(self.lens.interaction.side)
+        return self.lens.interaction.sent(self.source.axis)
 
     def _check_elements(self) -> None:
         if self.elements:

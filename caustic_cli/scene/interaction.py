@@ -84,6 +84,10 @@ class Refracting:
         side = np.where(along < 0, -1.0, 1.0)
         return n * (d - along * normal) + side * np.sqrt(np.maximum(square, 0.0)) * normal, square[..., 0] > 0
 
+    def sent(self, d: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Direction behind a surface without slopes of light that arrives along d."""
+        return d[0], d[1], self.side * d[2]
+
     def check_screen(self, z: float, z_in: float) -> None:
         """Check that a screen at z is on the side to which light leaves.
 

@@ -24,8 +24,14 @@ from caustic_cli.schema.table import check_all, default
 MAX_SAGS = 4096
 #: Largest half extent of a spherical or cylindrical screen, as a fraction of its radius: beyond it incidence is near grazing.
 STEEPEST = 0.98
+#: Least angle between the plane of a screen and the light, degrees: a beam is there a hundred times as long as it is wide.
+GRAZING = 0.5
 #: Radii of a plane screen.
 PLANE = (math.inf, math.inf)
+#: Sine of the angle between a direction and the y axis up to which they count as parallel.
+PARALLEL = 1e-9
+
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +69,8 @@ class Window:
         opening: its aperture.
     """
 
-    vertex: tuple[float, float, float]
-    axes: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    vertex: Vector
+    axes: tuple[Vector, Vector, Vector]
     opening: Aperture
 
     def passed(self, origin: Sequence[Any], direction: Sequence[Any]) -> Any:
@@ -93,9 +99,8 @@ class Screen:
     z: float = default("screen.z")
     #: Pixels along x and y.
     resolution: tuple[int, int] = (250, 250)
-    #: Right-handed rotations of the screen about its own centre, first about the fixed x axis, then about the fixed y axis,
-    #: degrees.
-    tilt: tuple[float, float] = default("screen.tilt")
+    #: Right-handed rotations of the screen about its own centre, (a, b) or (a, b, c), degrees: see `tilted`.
+    tilt: tuple[float, ...] = default("screen.tilt")
     #: Decentre of the screen along x and y, mm.
     shift: tuple[float, float] = default("screen.shift")
     #: Radii of curvature along x and y, mm: equal for a sphere, one of them inf for a cylinder; positive if the centre of curvature
@@ -111,6 +116,8 @@ class Screen:
 
     def __post_init__(self):
         check_all("screen", self, "size", "z", "resolution", "tilt", "shift")
+        if len(self.tilt) not in (2, 3):
+            raise InputError(f"⟨screen.tilt⟩ must be two or three angles, got {len(self.tilt)}")
         if any(isinstance(r, bool) or not isinstance(r, int | float) or math.isnan(r) or r == 0 for r in self.radius):
             raise InputError(f"⟨screen.radius⟩ must be non-zero numbers of mm or inf, got {list(self.radius)}")
         if self.radius[0] != self.radius[1] and all(map(math.isfinite, self.radius)):
@@ -154,6 +161,19 @@ class Screen:
                 f" {self.size[1]:g} mm to lie on {'the sphere' if len(bent) == 2 else 'the cylinder'}, got {bent[0][1]:g} mm"
             )
 
+    def check_facing(self, light: Vector) -> None:
+        """Check that light along a unit vector meets its plane at an angle.
+
+        Raises:
+            InputError: it does not.
+        """
+        angle = math.degrees(math.asin(min(1.0, abs(sum(map(mul, light, self.axes[2]))))))
+        if angle < GRAZING:
+            raise InputError(
+                f"⟨screen.tilt⟩ makes the screen nearly parallel to the light; {GRAZING:g} degrees between them are needed at"
+                f" least, got {angle:.2g}"
+            )
+
     def shape_words(self) -> str:
         """Its shape in words, such as "a sphere of radius 60 mm"."""
         if self.sags is not None:
@@ -185,23 +205,42 @@ class Screen:
         return self.shift[0] - self.half_size[0], self.shift[1] - self.half_size[1]
 
     @property
-    def axes(self) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
+    def axes(self) -> tuple[Vector, Vector, Vector]:
         """Unit vectors along its x and y axes, and its unit normal."""
         x, y, z = (self.in_space(axis) for axis in tilted(self.tilt))
         return x, y, z
 
     @property
-    def centre(self) -> tuple[float, float, float]:
+    def centre(self) -> Vector:
         """Its centre in the scene, mm."""
         return self.in_space((*self.shift, self.z))
 
-    def in_space(self, own: tuple[float, float, float]) -> tuple[float, float, float]:
+    def in_space(self, own: Vector) -> Vector:
         """A vector in the scene, from its components along the axes of the screen before its tilt; and the other way round."""
         x, y = (-c if reversed else c for c, reversed in zip(own[:2], self.mirrored, strict=True))
         return x, y, own[2]
 
 
-def tilted(tilt: tuple[float, float]) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
-    """The axes x, y, z after right-handed rotations about x first, then about y, degrees: unit vectors."""
-    (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, tilt))
-    return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
+def tilted(tilt: Sequence[float]) -> tuple[Vector, Vector, Vector]:
+    """The axes x, y, z after right-handed rotations about the fixed x axis by the first angle, then about the fixed y axis by the
+    second, degrees, and before both about z by a third, if there is one: unit vectors."""
+    (sa, ca), (sb, cb), *about_z = ((math.sin(t), math.cos(t)) for t in map(math.radians, tilt))
+    x, y, z = (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
+    for s, c in about_z:
+        x, y = _combined(c, x, s, y), _combined(-s, x, c, y)
+    return x, y, z
+
+
+def tilt_to(x: Vector, z: Vector) -> tuple[float, float, float]:
+    """The angles, degrees, by which `tilted` takes the axes to unit vectors x and z, perpendicular to each other; the second is 0
+    where the third does the same."""
+    a = math.asin(max(-1.0, min(1.0, -z[1])))
+    b = math.atan2(z[0], z[2]) if math.hypot(z[0], z[2]) > PARALLEL else 0.0
+    along_x, along_y, _ = tilted((math.degrees(a), math.degrees(b)))
+    c = math.atan2(*(sum(map(mul, axis, x)) for axis in (along_y, along_x)))
+    return math.degrees(a), math.degrees(b), math.degrees(c)
+
+
+def _combined(a: float, u: Vector, b: float, v: Vector) -> Vector:
+    x, y, z = (a * p + b * q for p, q in zip(u, v, strict=True))
+    return x, y, z

@@ -234,9 +234,9 @@ class SourceSettings(Section):
             " lens", option=Option("--cone", "DEG", BOTH))
     angle: float | None = setting("disc at infinity (the sun: 0.533): angular diameter", "degrees", 0.0, 170.0,
             derived="a disc at a finite distance", option=Option("--source-angle", "DEG", BOTH))
-    tilt: Pair = setting("direction of a plane wave: +z turned about the x axis, then about the y axis; the screen stands square to"
-            " its light unless told otherwise", "degrees", -80.0, 80.0, default=[0.0, 0.0], written=False,
-            option=Option("--source-tilt", "A,B", BOTH))
+    tilt: Pair = setting("direction of a plane wave or of a disc at infinity: +z turned about the x axis, then about the y axis;"
+            " the screen stands square to its light unless told otherwise", "degrees", -80.0, 80.0, default=[0.0, 0.0],
+            written=False, option=Option("--source-tilt", "A,B", BOTH))
     intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of"
             " degrees from +z and relative intensity", default="uniform", why="an isotropic source, the simplest",
             option=Option("--intensity", "uniform|lambertian|FILE", BOTH), file="intensity")
@@ -340,8 +340,9 @@ class ScreenSettings(Section):
             " millimetres")
     size: Pair = setting("full width and height", "mm", *SCREEN, derived="picture plus margin")
     resolution: Wholes = setting("pixels along x and y", low=2, high=16384, derived="250 across")
-    tilt: Pair = setting("rotation of the screen about its own centre: about the fixed x axis, then about the fixed y axis",
-            "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False, option=Option("--screen-tilt", "A,B", BOTH))
+    tilt: Numbers = setting("rotation of the screen about its own centre: about the fixed x axis, then about the fixed y axis;"
+            " before both, by a third angle, about its normal", "degrees", -180.0, 180.0, default=[0.0, 0.0], written=False,
+            option=Option("--screen-tilt", "A,B[,C]", BOTH))
     shift: Pair = setting("decentre of the screen; by default that of a mirror is shifted out of the light of its source", "mm",
             -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH))
     radius: Pair | None = setting("radii of curvature of a curved screen along x and y: the same for a sphere, inf along one axis"
@@ -519,6 +520,10 @@ class Parameters(Section):
 
     throw: float | None = setting("distance from the lens' origin to the screen, in front of a mirror", "mm", -1e12, 1e12,
             derived="300", option=Option("--throw", "MM"), speaks_for=("screen.z",), before="screen.z")
+    screen_place: str | None = setting("part of a room as the screen, where the light meets it: floor, ceiling or wall and its"
+            " distance from the lens, or any plane by a point, its normal towards the viewer and an upward direction",
+            derived="square to the light", option=Option("--screen", "PLACE"),
+            speaks_for=("screen.z", "screen.tilt", "screen.shift"), before="screen.z")
     screen_size: Pair | None = setting("full width and height of the screen; a single length keeps the picture's aspect ratio",
             "mm", derived="picture plus margin", option=Option("--screen-size", "W[xH]"), speaks_for=("screen.size",),
             before="screen.size")
@@ -527,6 +532,9 @@ class Parameters(Section):
             speaks_for=("screen.resolution",), before="screen.resolution")
     mag: float = setting("width of the picture in lens widths", low=1e-3, high=1e3, default=3.0, why="table 6.1 of the thesis",
             option=Option("--mag"), before="target.file")
+    picture_size: Pair | None = setting("full width and height of the picture on the screen instead of a magnification; a single"
+            " length keeps its aspect ratio", "mm", derived="by the magnification", option=Option("--picture-size", "W[xH]"),
+            speaks_for=("target.size",), before="target.file")
     margin: float = setting("total width of the dark border relative to the picture", low=0.0, high=100.0, default=0.28,
             why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, which shows stray light", option=Option("--margin"),
             before="target.file")

@@ -95,7 +95,7 @@ def run_diffraction(
         InputError: the index varies, or the entrance is free-form.
     """
     DIFFRACTION.refuse(scene)
-    plane = replace(scene, source=PlaneWave(scene.source.power), light=Light())
+    plane = replace(scene, source=PlaneWave(scene.source.power, tilt=scene.source.tilt), light=Light())
     own = plane.lens.size[0]
     cases = _cases(own)
     count = rays or A_PIXEL * math.prod(plane.screen.resolution)
@@ -103,7 +103,7 @@ def run_diffraction(
     for k, (series, value, wavelength, angle, factor) in enumerate(cases):
         one, net, lifted = scaled(plane, field, heights.detach().double(), factor)
         if angle:
-            one = replace(one, source=Disc(power=plane.source.power, angle=angle))
+            one = replace(one, source=Disc(power=plane.source.power, angle=angle, tilt=plane.source.tilt))
         key = factor, angle
         if key not in drawn:
             drawn = {key: _rays(one, net, lifted, count, seed)}

@@ -33,13 +33,17 @@ def sample_rays(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[t
             if source.brightness is not None:
                 dx, dy = source.frame[0] * _on_picture(source.brightness, n, rng)
             d = np.array([dx, dy, np.sqrt(1 - dx**2 - dy**2)])
+            if source.oblique:
+                across, d = d[2], _turned(np.array(source.axis), d)
+                one = d[2] / (across * source.axis[2])  # the radiance's part that the aperture receives
+                one = one / (1.0 if source.brightness is None else one.mean())
             x, y = (
                 ((2 * u - 1) * rx, (2 * v - 1) * ry)
                 if not round_
                 else (rx * np.sqrt(u) * np.cos(2 * np.pi * v), rx * np.sqrt(u) * np.sin(2 * np.pi * v))
             )
             if source.profile is not None:
-                one = _profile(source.profile, x / rx, y / ry) / mean
+                one = one * _profile(source.profile, x / rx, y / ry) / mean
             yield np.array([x, y, np.full(n, z_in)]) - (1 + (z_in - lowest) / d[2]) * d, d, one
             continue
         cone = source.cone_over(pupil)
@@ -55,6 +59,14 @@ def sample_rays(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[t
         o = STARTS[source.kind](source, u, v, rng)
         near = d[2] > 1e-6  # start at most 1 mm before the entrance, for single precision
         yield o + d * np.where(near, np.maximum((lowest - o[2]) / np.where(near, d[2], 1) - 1, 0), 0), d, one
+
+
+def _turned(axis: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Vectors (3, N) turned by the rotation that takes +z to a unit vector, about the line perpendicular to both (Rodrigues)."""
+    about = np.cross([0.0, 0.0, 1.0], axis)
+    sine, cosine = np.linalg.norm(about), axis[2]
+    k = about / sine
+    return d * cosine + np.cross(k, d.T).T * sine + np.outer(k, (k @ d) * (1 - cosine))
 
 
 def _on_points(source: Source, u: np.ndarray, _v: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,7 +21,7 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import tracers
-from caustic_cli.scene import Lens, Light, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
 from caustic_cli.workflow.reporter import Reporter
 
 #: Seconds of compilation before the user is told.
@@ -124,7 +125,9 @@ def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = Fal
     Net and image are small, and a plane wave or a point represents the source.  gradient: compile the adjoints, too.
     """
     lens = replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None, array=(1, 1))
-    source = PlaneWave(tilt=scene.source.tilt) if scene.source.parallel else Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
+    given, source = scene.source, Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
+    if given.distant:
+        source = PlaneWave(tilt=given.tilt) if given.parallel else Disc(angle=math.degrees(2.0 * given.half_angle), tilt=given.tilt)
     scene, field = Scene(source, lens, scene.screen, Light(scene.light.polarisation)), HeightField.of(lens)
     heights = torch.full((4, 4), lens.offset.thickness, dtype=torch.float64, requires_grad=gradient)
     screen = replace(scene.screen, resolution=(4, 4))

@@ -20,12 +20,12 @@ class ScreenTilt(Effect):
 
     def decide(self, scene: Scene, bounds) -> Decision:
         """Needed if the screen is tilted."""
-        (a, b), some = scene.screen.tilt, any(scene.screen.tilt)
+        tilt, some = scene.screen.tilt, any(scene.screen.tilt)
         return Decision(
             self.name,
             some,
-            f"the screen is tilted by {a:g} and {b:g} degrees" if some else "the screen is upright",
-            max(abs(a), abs(b)),
+            f"the screen is tilted by {' and '.join(f'{t:g}' for t in tilt)} degrees" if some else "the screen is upright",
+            max(map(abs, tilt)),
             0.0,
             present=some,
         )

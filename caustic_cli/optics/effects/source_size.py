@@ -33,5 +33,5 @@ class SourceSize(Effect):
         """The sun, or a small disc."""
         s = scene.source
         if s.distant:
-            return Probe(replace(scene, source=Disc(power=s.power, angle=SUN)), None, f"{SUN} degrees")
+            return Probe(replace(scene, source=Disc(power=s.power, angle=SUN, tilt=s.tilt)), None, f"{SUN} degrees")
         return Probe(replace(scene, source=Disc(s.centre, (SIZE, SIZE), s.power, s.cone)), None, f"{SIZE:g} mm")

@@ -114,13 +114,25 @@ def modes(scene: Illuminated, each: int) -> list[Mode]:
     source = scene.source
     if source.distant:
         spread = _spots(source, each)
-        return [Mode(scene, _direction(source, dx, dy), 1.0 / len(spread)) for dx, dy in spread]
+        ways = [_direction(source, dx, dy) for dx, dy in spread]
+        whole = math.fsum(z for *_, z in ways) if source.oblique else len(ways)  # of the radiance, the cosine to the aperture
+        return [Mode(scene, way, (way[2] if source.oblique else 1.0) / whole) for way in ways]
     (positions, parts), spread = source.points(), _spots(source, each)
     return [
         Mode(scene, (float(x + dx), float(y + dy), float(z)), float(part) / len(spread))
         for (x, y, z), part in zip(positions, parts, strict=True)
         for dx, dy in spread
     ]
+
+
+def offset(source: Source, position: tuple[float, float, float]) -> tuple[float, float]:
+    """Displacement of a mode's position from the source's centre, mm, or of a direction from its axis, in sines."""
+    x, y, z = position
+    if not source.distant:
+        return x - source.centre[0], y - source.centre[1]
+    a, b, c = source.axis
+    along = (x * a + y * b) / (1.0 + c) + z  # the rotation that takes the axis to +z without twist
+    return x - a * along, y - b * along
 
 
 def _direction(source: Source, across: float, along: float) -> tuple[float, float, float]:

@@ -121,7 +121,8 @@ class BeamKernel(PlaneKernel):
     def __init__(self, spaces, half_size, beam: Beam, entrance: tuple[float, str], like: BeamKernel | None = None):
         sample = beam.sample
         super().__init__(spaces, half_size, sample.u, sample.v, sample.tensor, sample.flux, like)
-        self.z_in, (self.kx, self.ky), self.half_size = beam.z_in, beam.inside(entrance[0]), beam.aperture.half_size
+        self.direction, self.z_in, (self.kx, self.ky) = beam.direction, beam.z_in, beam.inside(entrance[0])
+        self.half_size = beam.aperture.half_size
         self.round, self.power = bool(beam.aperture.round), beam.irradiance * beam.transmittance(*entrance)
 
     def onto(self, sag: Tensor, eta: float, fresnel: str, reference: float, receiver: Receiver, filter: Filter):
@@ -133,9 +134,12 @@ class BeamKernel(PlaneKernel):
     def _light(self, receiver: Receiver, reference: float) -> ParallelLight:
         kx, ky = self.kx, self.ky
         middle = (*receiver.middle[:2], receiver.middle[2] - reference)
-        e1, e2, e3 = (Components(*map(float, axis)) for axis in receiver.axes)
-        c1, c2, c3 = (float(dot(middle, axis)) for axis in receiver.axes)
-        on1, on2, on3 = (float(dot((kx, ky, 1.0), axis)) for axis in receiver.axes)
+        along_x, along_y, normal = receiver.axes
+        forward = 1.0 if dot(normal, self.direction) > 0 else -1.0
+        axes = along_x, along_y, (forward * normal[0], forward * normal[1], forward * normal[2])  # the last in the way of the light
+        e1, e2, e3 = (Components(*map(float, axis)) for axis in axes)
+        c1, c2, c3 = (float(dot(middle, axis)) for axis in axes)
+        on1, on2, on3 = (float(dot((kx, ky, 1.0), axis)) for axis in axes)
         over_x, over_y = (1.0 / r for r in self.half_size)
         long2 = 1.0 + kx * kx + ky * ky
         return ParallelLight(kx, ky, long2, self.power, over_x, over_y, self.round, e1, e2, e3, c1, c2, c3, on1, on2, on3)

@@ -96,7 +96,7 @@ class Source:
     @property
     def oblique(self) -> bool:
         """Whether it is at infinity, and not in the direction of z."""
-        return any(self.tilt)
+        return self.distant and any(self.tilt)
 
     @property
     def half_angle(self) -> float:
@@ -203,7 +203,9 @@ class Source:
 
         To first order it is the throw times the angle that the source subtends at the lens, which bounds the resolution.
         """
-        return throw * 2.0 * self.half_angle if self.distant else throw * self._width() / (z_in - self.nearest)
+        if self.distant:
+            return throw / math.cos(self.lean) * 2.0 * self.half_angle
+        return throw * self._width() / (z_in - self.nearest)
 
     def cone_over(self, pupil: Pupil) -> float:
         """Half-angle of the emission cone about the axis: as given, or the least that covers the pupil from every

@@ -12,7 +12,7 @@ import numpy as np
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
-from caustic_cli.scene.sources.plane import PlaneWave
+from caustic_cli.scene.sources.plane import PlaneWave, direction
 from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.section import (
     SourceType,
@@ -23,7 +23,7 @@ from caustic_cli.scene.sources.section import (
     position_defaults,
     single_position,
 )
-from caustic_cli.schema.table import check, check_all
+from caustic_cli.schema.table import check, check_all, default
 
 #: Intervals of each step that locates the farthest point of an ellipse, and steps: the angle to 1e-6, the distance to 1e-12.
 ZOOM, ZOOMS = 64, 4
@@ -42,6 +42,7 @@ class Disc(Source):
             ignored.
         brightness: relative radiance over the ellipse's bounding rectangle, (a, b) [i, j] with i along +x, instead of uniform
             radiance; for a disc at infinity over direction sines.
+        tilt: of the axis of a disc at infinity, see `PlaneWave`.
     """
 
     position: tuple[float, float, float] = (0.0, 0.0, -50.0)
@@ -53,6 +54,7 @@ class Disc(Source):
     angle: float | None = None
     brightness: np.ndarray | None = field(default=None, compare=False)
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    tilt: tuple[float, float] = (0.0, 0.0)
 
     kind = "disc"
 
@@ -70,6 +72,8 @@ class Disc(Source):
             object.__setattr__(self, "brightness", light)
             if self.distant and self.frame[0] * self._reach[2] >= 1.0:
                 raise InputError(f"⟨source.angle⟩ of {self.angle:g} degrees is too wide for a picture whose corners lie beyond it")
+        if self.distant:
+            object.__setattr__(self, "axis", direction(self.tilt, self.half_angle))
 
     @property
     def distant(self) -> bool:
@@ -182,7 +186,7 @@ class Disc(Source):
     def pointlike(self) -> Source:
         """A plane wave, or a point at its centre."""
         if self.distant:
-            return PlaneWave(self.power)
+            return PlaneWave(self.power, tilt=self.tilt)
         place = self.position if self.brightness is None else self.centre
         return Points((place,), (self.power,), self.cone, self.intensity, self.aimed, axis=self.axis)
 
@@ -197,15 +201,20 @@ def _build(table: Table, _profile) -> Disc:
         table["power"],
         angle=table.get("angle"),
         brightness=light,
+        tilt=tuple(table.get("tilt") or default("source.tilt")),
         **emission_arguments(table),
     )
 
 
 def _idle(table: Table) -> dict[str, str]:
     why = "has no meaning for a disc at infinity, whose size is an angle (⟨source_angle⟩)"
-    return dict.fromkeys(("position", "size", "cone"), why) if "angle" in table else {}
+    if "angle" in table:
+        return dict.fromkeys(("position", "size", "cone"), why)
+    return {"tilt": "is for light from infinity: a plane wave, or a disc with an angle (⟨source_angle⟩)"}
 
 
 TYPES = (
-    SourceType("disc", "disc", ("position", "size", "cone", "angle", "intensity", "aim", "file"), _build, position_defaults, _idle),
+    SourceType(
+        "disc", "disc", ("position", "size", "cone", "angle", "intensity", "aim", "file", "tilt"), _build, position_defaults, _idle
+    ),
 )

@@ -33,8 +33,7 @@ class PlaneWave(Source):
 
     def __post_init__(self):
         check("source.power", self.power)
-        check_tilt(self.tilt)
-        object.__setattr__(self, "axis", tilted(self.tilt)[2])
+        object.__setattr__(self, "axis", direction(self.tilt))
         if self.profile is not None:
             e = np.asarray(self.profile, dtype=float)
             with np.errstate(over="ignore"):
@@ -62,19 +61,21 @@ class PlaneWave(Source):
 GRAZING = 80.0
 
 
-def check_tilt(tilt: tuple[float, float]) -> None:
-    """Check the direction of light from infinity.
+def direction(tilt: tuple[float, float], half_angle: float = 0.0) -> tuple[float, float, float]:
+    """The direction of light from infinity, a unit vector; half_angle: of its rays to it, rad.
 
     Raises:
         InputError: it grazes the entrance, or does not reach it.
     """
     check("source.tilt", tilt)
-    angle = math.degrees(math.acos(min(1.0, tilted(tilt)[2][2])))
-    if not angle <= GRAZING:
+    axis = tilted(tilt)[2]
+    angle = math.degrees(math.acos(max(-1.0, min(1.0, axis[2]))) + half_angle)
+    if any(tilt) and not angle <= GRAZING:
         raise InputError(
             f"⟨source.tilt⟩ must keep the light within {GRAZING:g} degrees of +z, got {angle:.3g}: at grazing incidence the"
             " entrance reflects it, and beyond 90 degrees it comes from behind"
         )
+    return axis
 
 
 def _plane(table: Table, profile: np.ndarray | None) -> PlaneWave:
