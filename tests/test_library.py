@@ -197,7 +197,8 @@ def test_every_setting_is_a_keyword():
     usual = {name: TABLE[path].default for name, path in known.items() if path in TABLE and TABLE[path].default is not None}
     given = keywords.checked(keywords.from_keywords("design", usual), {}, "here")
     assert len(given) > 40 and all(given[path] == TABLE[path].default for path in given)
-    assert set(keywords.keywords("render").values()) == {row.path for row in options_of("render")}
+    rows = list(options_of("render"))
+    assert set(keywords.keywords("render").values()) == {path for row in rows for path in (row.path, *row.speaks_for)}
 
 
 def test_keywords_say_what_sections_say(monkeypatch):

@@ -152,6 +152,13 @@ worse than the finished lens, at the wavelengths of the design.
 For a tolerance study: draws, error_by, percentiles p5, p50 and p95 of error (as placed; also as relative_rms),
 shifted_relative_rms (after the best shift of the screen) and on_target, sensitivities, offenders, wave_check, csv, plot.
 .TP
+.B day
+For a day of sunlight: times, rows of time, azimuth and elevation of the sun, incidence on the pane, error on the screen where it
+stands, followed_error on one that follows the picture, moved (mm along the screen's x and y since the light of the design),
+brightness (power on the picture over that of the design, in a beam of the same irradiance) and on_screen (part of it on the screen
+where it stands); periods as_designed, legible and on_screen, each with its first and last time; the error of the design;
+as_designed_error and legible_error, the bounds; film, plot.
+.TP
 .B want
 For an array with a prescribed illumination: brightness of each lenslet's source relative to the largest, N lists of M; error, the
 relative RMS error of the resulting image; kkt_residual; power, as a fraction of what all sources would require; image.

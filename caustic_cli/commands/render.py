@@ -140,6 +140,15 @@ class OutputOptions(options.Given):
             " sensitivities, percentiles of error and light, worst offenders; writes tolerances.csv and .png beside the image.",
         ),
     ] = None
+    day: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DATE",
+            help="For a lens in a window (--sun): also follow the sun on a day like 2026-06-21, in the time zone of the design: how"
+            " long the picture is legible, where it wanders, how bright it is; writes day.gif and day.png beside the image, by"
+            " 200,000 rays a time unless --rays says otherwise.",
+        ),
+    ] = None
     want: Annotated[
         Path | None,
         typer.Option(
@@ -209,7 +218,7 @@ def _checked_size(asked: RenderOptions) -> list[int]:
     radius = asked.tool_radius
     if radius is not None and not ((asked.report or asked.cut) and radius > 0):
         raise InputError(f"--tool-radius belongs to --report and --cut and must be greater than 0 mm, got {radius:g}")
-    designed = [option for option in ("verify", "explain", "html", "rays-plot") if getattr(asked, option.replace("-", "_"))]
+    designed = [option for option in ("verify", "explain", "html", "rays-plot", "day") if getattr(asked, option.replace("-", "_"))]
     if asked.cut and designed:
         raise InputError(f"--cut goes without --{designed[0]}, which looks at the surface as designed")
     if asked.verify not in (None, "mitsuba"):

@@ -62,9 +62,9 @@ class Sunlight:
         return self.room.tilt(_from(self.sun(time)))
 
     def shines(self, time: datetime) -> bool:
-        """Whether the sun stands above the horizon and its light enters the pane, within GRAZING of its normal."""
+        """Whether the sun stands above the horizon and all of its light is within GRAZING of the pane's normal."""
         seen = self.sun(time)
-        return seen.elevation > 0.0 and self.room.incidence(_from(seen)) <= GRAZING
+        return seen.elevation > 0.0 and self.room.incidence(_from(seen)) + seen.diameter / 2.0 <= GRAZING
 
     def check(self, time: datetime) -> None:
         """Check that the sun shines through the pane.
@@ -78,7 +78,7 @@ class Sunlight:
             above = in_words(hours(lambda t: self.sun(t).elevation > 0.0, day, zone))
             raise InputError(f"{at} is {-seen.elevation:.1f} degrees below the horizon; it is above it {above} that day")
         angle = self.room.incidence(_from(seen))
-        if angle > GRAZING:
+        if not self.shines(time):
             how = "shines on the pane from behind" if angle >= 90.0 else f"grazes the pane, {angle:.1f} degrees from its normal"
             raise InputError(
                 f"{at} at azimuth {seen.azimuth:.1f} and elevation {seen.elevation:.1f} degrees {how}, which faces"

@@ -137,16 +137,25 @@ def recorder(path: Path | None, force: bool) -> NoMovie:
 
 
 def _drawn(frame: Frame) -> Image.Image:
-    """The enlarged picture above its two lines of text, white on black."""
-    rows, columns = frame.codes.shape[:2]
-    width = max(320, round(HEIGHT * columns / rows / 2) * 2)
-    picture = Image.fromarray(frame.codes).resize((round(HEIGHT * columns / rows), HEIGHT), Image.Resampling.BILINEAR)
+    """A frame of a design."""
+    return captioned(enlarged(frame.codes), *frame.words)
+
+
+def enlarged(codes: np.ndarray) -> Image.Image:
+    """8-bit pixels, (rows, columns) or (rows, columns, 3), as a picture of the height of a movie."""
+    rows, columns = codes.shape[:2]
+    return Image.fromarray(codes).resize((round(HEIGHT * columns / rows), HEIGHT), Image.Resampling.BILINEAR)
+
+
+def captioned(picture: Image.Image, *words: str) -> Image.Image:
+    """A picture above two lines of text, white on black: a frame of a movie."""
+    width = max(320, round(picture.width / 2) * 2)
     sheet = Image.new(picture.mode, (width, HEIGHT + 2 * LINE + 8))
     sheet.paste(picture, ((width - picture.width) // 2, 0))
     draw = ImageDraw.Draw(sheet)
     import matplotlib  # noqa: PLC0415 - for its font
 
     font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), LETTERS)
-    for k, (line, shade) in enumerate(zip(frame.words, (235, 170), strict=True)):
+    for k, (line, shade) in enumerate(zip(words, (235, 170), strict=True)):
         draw.text((10, HEIGHT + 4 + k * LINE), line, fill=shade if sheet.mode == "L" else (shade,) * 3, font=font)
     return sheet

@@ -7,6 +7,7 @@ from typing import Any
 
 from caustic_cli.workflow.outputs.base import Output
 from caustic_cli.workflow.outputs.cut import MachinedSurface
+from caustic_cli.workflow.outputs.day import DayOfSunlight
 from caustic_cli.workflow.outputs.explanation import Explanation
 from caustic_cli.workflow.outputs.illumination import Illumination
 from caustic_cli.workflow.outputs.image import RayPicture
@@ -30,6 +31,7 @@ OUTPUTS: tuple[type[Output], ...] = (
     ManufacturingReport,
     ToleranceAnalysis,
     Illumination,
+    DayOfSunlight,
     RaysPlot,
     MitsubaComparison,
 )
