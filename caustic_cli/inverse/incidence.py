@@ -183,7 +183,8 @@ def lit_rectangle(
             places = list(lines)
             places[axis] = np.array([limit[axis]])
             depth = float(surface(*places).min()) - lens.pupil.z
-            limit[axis] = math.copysign(lens.half_size[axis], -slope) + slope * depth
+            half = lens.half_size[axis]
+            limit[axis] = min(half, max(-half, math.copysign(half, -slope) + slope * depth))
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise InputError("⟨source.tilt⟩: all light leaves the lens through its sides; a thinner lens or less tilt keeps some")
     return (low[0], low[1]), (high[0], high[1])

@@ -30,7 +30,7 @@ from caustic_cli.inverse.transport import cell_lines, cell_means, corners
 from caustic_cli.optics.interface import slopes_inside
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Component, Lens, Scene
+from caustic_cli.scene import Aperture, Component, Lens, Scene
 from caustic_cli.scene.elements import SIDES
 
 #: Most cells for which transport is solved.  Where more are needed, as for creases, it is solved on about COARSE, and the map is
@@ -101,7 +101,8 @@ class _Grid:
         (mx, my), whole = self.middle, self.whole
         if not (mx or my):
             return whole
-        lens = replace(whole.lens, size=(2.0 * float(self.x[-1]), 2.0 * float(self.y[-1])))
+        size = 2.0 * float(self.x[-1]), 2.0 * float(self.y[-1])
+        lens = replace(whole.lens, size=size, aperture=Aperture.name)  # what is dark of it is so in `incident`
         (sx, sy) = whole.screen.shift
         return replace(whole, lens=lens, screen=replace(whole.screen, shift=(sx - mx, sy - my)))
 
