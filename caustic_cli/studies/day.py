@@ -141,7 +141,11 @@ class Follower:
         return self._image * self.scene.source.axis[2]
 
     def at(self, time: datetime) -> Seen:
-        """The picture at a time at which the sun shines through the pane."""
+        """The picture at a time at which the sun shines through the pane.
+
+        Raises:
+            InputError: the light grazes the plane of the screen, or meets it where that reaches the lens.
+        """
         sun, scene = self.light.sun(time), replace(self.scene, source=replace(self.scene.source, tilt=self.light.tilt(time)))
         cosine, landing = scene.source.axis[2], self._landing(scene)
         place = _median(landing)
@@ -167,8 +171,13 @@ class Follower:
         view = scene.screen.grown((pixels[0], pixels[1]))
         if not any(bool(((abs(x) < view.half_size[0]) & (abs(y) < view.half_size[1]) & (w > 0)).any()) for x, y, w in landing):
             return np.zeros((*self.target.shape[:-2], *view.resolution)), None
-        halves = self._halves(scene, view)
         inner = (..., *(slice(n, n + m) for n, m in zip(pixels, scene.screen.resolution, strict=True)))
+        try:
+            halves = self._halves(scene, view)
+        except InputError:  # it reaches the lens, as a floor below a window does
+            halves, around = self._halves(scene, scene.screen), np.zeros((*self.target.shape[:-2], *view.resolution))
+            around[inner] = mean_of(halves).image.cpu().numpy()
+            return around, halves
         return mean_of(halves).image.cpu().numpy(), [replace(half, image=half.image[inner]) for half in halves]
 
     def _followed(self, scene: Scene, at: tuple[float, float]) -> tuple[np.ndarray, tuple[float, float], float, float]:
@@ -292,17 +301,26 @@ def follow_day(
     progress: Callable[[str, int, int], None] = lambda what, done, whole: None,
 ) -> tuple[Day, list[T]]:
     """The hours of sun of a day in steps of STEP minutes, and in shorter ones while light is on the screen and where the picture
-    becomes legible; and what `keep` makes of what is seen at each time."""
+    becomes legible, as far as the light meets the plane of the screen; and what `keep` makes of what is seen at each time.
+
+    Raises:
+        InputError: it never does.
+    """
     found: dict[datetime, tuple[Instant, T]] = {}
 
     def look(times: Iterable[datetime], why: str) -> None:
         todo = [t for t in times if t not in found]
         for k, time in enumerate(todo):
             progress(f"{why}, {time:%H:%M}", k, len(todo))
-            seen = follower.at(time)
+            try:
+                seen = follower.at(time)
+            except InputError:  # there is no picture in the plane of the screen
+                continue
             found[time] = seen.instant, keep(seen)
 
     look(_every(shines, STEP), "the sun's day")
+    if not found:
+        raise InputError("⟨day⟩ needs light on the plane of the screen, and there is none at any time of that day")
     look(_between(Day(follower.error, follower.bounds, _sorted(found)), shines), "while the picture is on the screen")
     return Day(follower.error, follower.bounds, _sorted(found)), [found[time][1] for time in sorted(found)]
 
