@@ -283,7 +283,10 @@ def test_marks_name_settings(capfd):
     marked = {name.lstrip("+") for p in FILES if p.name != "errors.py" for name in MARK.findall(p.read_text("utf-8"))}
     paths = {name.replace("source.also.", "source.") for name in marked if "." in name and not name.endswith(("_", "."))}
     assert len(paths) > 30 and paths <= set(TABLE)
-    assert {"--" + name.replace("_", "-") for name in marked if "." not in name} <= options
+    named = {
+        name: TABLE[name].option.name if name in TABLE else "--" + name.replace("_", "-") for name in marked if "." not in name
+    }
+    assert {*named.values()} <= options
 
 
 def test_a_message_names_the_option_that_said_it(capfd):

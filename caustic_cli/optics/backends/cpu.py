@@ -5,9 +5,11 @@ The reference handles stages without a kernel, and empty sets of rays.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from functools import lru_cache
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -46,9 +48,29 @@ class Numba(Torch):
     name = "numba"
     compiled = True
 
+    def __init__(self) -> None:
+        self.kept: dict[int, tuple[Any, FusedSurface]] | None = None
+
     def precision(self, dtype: torch.dtype) -> torch.dtype:
         """float64."""
         return torch.float64
+
+    @contextlib.contextmanager
+    def keeping_surfaces(self) -> Iterator[None]:
+        """As the reference: with the polynomials of the last heights, which take a gigabyte for 3000 x 3000 control points."""
+        before, self.kept = self.kept, {} if self.kept is None else self.kept
+        try:
+            yield
+        finally:
+            self.kept = before
+
+    def surface_of(self, field) -> FusedSurface:
+        """Kernel data of a height field."""
+        if self.kept is None:
+            return FusedSurface(field.spaces, field.half_size)
+        if id(field) not in self.kept:
+            self.kept[id(field)] = field, FusedSurface(field.spaces, field.half_size)
+        return self.kept[id(field)][1]
 
     def scatter(
         self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: torch.device | str
@@ -62,7 +84,7 @@ class Numba(Torch):
         """As the reference; tensor-product samples by rows, from nets contracted along v."""
         if sample.tensor:
             return GridSurface(field.spaces, field.half_size, sample.u, sample.v)
-        surface, u, v = FusedSurface(field.spaces, field.half_size), sample.u.contiguous().numpy(), sample.v.contiguous().numpy()
+        surface, u, v = self.surface_of(field), sample.u.contiguous().numpy(), sample.v.contiguous().numpy()
         return lambda sag: scattered_surface(surface, sag, u, v)
 
     def spline_at(self, field, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -70,7 +92,7 @@ class Numba(Torch):
         if not len(x):
             return super().spline_at(field, heights, x, y)
         at = ((0.5 * (c / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
-        return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at)
+        return scattered_surface(self.surface_of(field), heights.double(), *at)
 
     def intersect_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As the reference."""
@@ -78,14 +100,14 @@ class Numba(Torch):
         ox, oy, oz, dx, dy, dz = (c.contiguous() for c in torch.broadcast_tensors(*rays))
         if not ox.numel():
             return super().intersect_spline(field, heights, origin, direction, side)
-        surface = FusedSurface(field.spaces, field.half_size)
+        surface = self.surface_of(field)
         return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
 
     def intersect_fixed(self, field, origin, direction):
         """As the reference; for rays that start inside the aperture, data independent of the heights is precomputed."""
         if any(bool((c.abs() > half).any()) for c, half in zip(origin[:2], field.half_size, strict=True)):
             return lambda heights: self.intersect_spline(field, heights, origin, direction, 1.0)
-        hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, None)
+        hits = RayIntersections(self.surface_of(field), origin, direction, None)
 
         def intersect(heights: Tensor) -> SurfaceIntersection:
             t, gx, gy = hits(heights)
@@ -114,13 +136,13 @@ class Numba(Torch):
         start, found = method.start(field, heights, origin, direction, radius)
         if found is not None:
             return found
-        hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, radius)
+        hits = RayIntersections(self.surface_of(field), origin, direction, radius)
         hits.find(heights, None if start is None else np.ascontiguousarray(start.numpy()))
         return torch.from_numpy(hits.t), torch.from_numpy(hits.status).long()
 
     def finder(self, field, origin, direction):
         """As the reference."""
-        hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, None)
+        hits = RayIntersections(self.surface_of(field), origin, direction, None)
 
         def find(heights: Tensor) -> tuple[Tensor, Tensor]:
             hits.find(heights)
@@ -132,9 +154,7 @@ class Numba(Torch):
         """As the reference."""
         if not len(origin[0]):
             return super().next_intersections(field, heights, origin, direction, below, round, step)
-        return next_intersections(
-            FusedSurface(field.spaces, field.half_size), heights, origin, direction, below, round, step, HALVINGS, MOST_STEPS
-        )
+        return next_intersections(self.surface_of(field), heights, origin, direction, below, round, step, HALVINGS, MOST_STEPS)
 
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0

@@ -5,6 +5,8 @@ Stages of optional capabilities are in modules of their own, loaded when they ar
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from importlib import import_module
 from typing import Any
 
@@ -38,6 +40,11 @@ class Torch:
     ) -> list[Tensor]:
         """Random points u, v of the unit square for rays start..stop, `stratified` in cells: see `sampling`."""
         return scattered_points(seed, start, stop, shape, stratified, device)
+
+    @contextlib.contextmanager
+    def keeping_surfaces(self) -> Iterator[None]:
+        """Within it, what has been prepared for a height field serves all intersections with it."""
+        yield
 
     def spline_on(self, field, sample: Sample, dtype: torch.dtype):
         """A function of sags (n, m) mm: height (mm) and slopes at the points of a sample, (N,) each in `dtype`."""

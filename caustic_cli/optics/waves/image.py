@@ -197,15 +197,18 @@ def image_of(
     by_source: dict[int, list[Line]] = {}
     for line in lines:
         by_source.setdefault(id(line.system.source), []).append(line)
-    for light in by_source.values():
-        imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=perturbation is not None)
-        imager = replace(imager, perturbation=perturbation)
-        if (samples := imager.sampling.samples * len(light) * len(imager.modes(light[0].system))) > most:
-            raise NoWaveImage(
-                f"a wave image of this scene takes {samples:.2g} samples, about {samples / A_SECOND / 60:.0f} minutes on two cores;"
-                " the effect diffraction, requested by name, computes it"
+    with backend_for(next(iter(parameters.values())).device).keeping_surfaces():
+        for light in by_source.values():
+            imager = Imager.of(
+                light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=perturbation is not None
             )
-        found.append(imager.expose(light, parameters, dtype))
+            imager = replace(imager, perturbation=perturbation)
+            if (samples := imager.sampling.samples * len(light) * len(imager.modes(light[0].system))) > most:
+                raise NoWaveImage(
+                    f"a wave image of this scene takes {samples:.2g} samples, about {samples / A_SECOND / 60:.0f} minutes on two"
+                    " cores; the effect diffraction, requested by name, computes it"
+                )
+            found.append(imager.expose(light, parameters, dtype))
     return (
         found[0]
         if len(found) == 1
