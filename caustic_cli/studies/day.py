@@ -1,4 +1,4 @@
-"""The picture of a lens in a window through a day: where the sun carries it, and how long it is recognised.
+"""The picture of a lens in a window through a day: where the sun carries it, and how long it is legible.
 
 Lens and screen stand still, and the sun moves.  At each time the light is traced to the plane of the screen, and the image looked
 at twice: on the screen where it stands, and on a screen of the same size that is moved in that plane after the picture, to the
@@ -47,8 +47,10 @@ from caustic_cli.studies.retrace import limited_to_source, mean_of, sampler_for
 from caustic_cli.studies.tolerances import best_shift
 
 DAY = Capability("a day of sunlight", {"curved screen": "⟨day⟩ moves a plane screen after its picture, and this one has {}"})
-#: Rays of a time, both halves included; rays that find the median of the light, and points along the coarse surface that they pass.
-RAYS, FINDING, COARSE = 200_000, 4_000, 64
+#: Rays of a time, both halves included, and by how many times fewer match the picture to the target.
+RAYS, MATCHING = 200_000, 8
+#: Rays that find the median of the light, and points along each axis of the coarse surface that they pass.
+FINDING, COARSE = 4_000, 64
 #: Periods of a day, properties of it.
 PERIODS = ("as_designed", "legible", "on_screen")
 #: Steps while the sun shines through the pane, minutes, and most times between them.
@@ -182,7 +184,7 @@ class Follower:
 
     def _followed(self, scene: Scene, at: tuple[float, float]) -> tuple[np.ndarray, tuple[float, float], float, float]:
         """Image on the screen moved after the picture from `at`, mm; by how much; F; and the power there."""
-        first = next(self._images(scene, moved(scene.screen, *at))).image.cpu().numpy()
+        first = next(self._images(scene, moved(scene.screen, *at), self.rays // MATCHING)).image.cpu().numpy()
         if first.sum() > 0:
             grey = (a.sum(0) if a.ndim == 3 else a for a in (first, self.target))
             _, shift = best_shift(*(a / a.mean() for a in grey))
@@ -200,13 +202,14 @@ class Follower:
 
     def _halves(self, scene: Scene, screen: Screen) -> list[Image]:
         """Images on a screen of two independent halves of the rays."""
-        return list(self._images(scene, screen))
+        return list(self._images(scene, screen, self.rays // 2))
 
-    def _images(self, scene: Scene, screen: Screen) -> Iterator[Image]:
+    def _images(self, scene: Scene, screen: Screen, rays: int) -> Iterator[Image]:
+        """Independent images of so many rays each."""
         one, heights = scene.onto(screen), self.heights.to(self.device)
         for k in (0, 1):
-            rays = sampler_for(one.batch(k, 2), max(1, self.rays // 2), stream(self.seed, f"day {k}"), self.device)
-            yield limited_to_source(expose(one, self.field, heights, rays))
+            sampler = sampler_for(one.batch(k, 2), max(1, rays), stream(self.seed, f"day {k}"), self.device)
+            yield limited_to_source(expose(one, self.field, heights, sampler))
 
     def _landing(self, scene: Scene) -> Landing:
         """Landing points of rays through the coarse surface."""
