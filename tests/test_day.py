@@ -7,12 +7,17 @@ from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
+import torch
 from helpers import write_blob
 from PIL import Image
 
 from caustic_cli import cli, load
-from caustic_cli.scene import Screen
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.trace import expose
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.room import Room
+from caustic_cli.scene.room_screen import placed
 from caustic_cli.scene.screen import tilted
 from caustic_cli.scene.sunlight import Sunlight, moment
 from caustic_cli.studies import day as study
@@ -69,6 +74,29 @@ def test_it_wanders_like_a_ray_through_the_middle(follower, minutes):
     found = follower.at(time).instant
     assert np.linalg.norm(np.subtract(found.moved, expected)) < 0.1 * np.linalg.norm(expected) + 0.1
     assert abs(expected[0]) > abs(minutes)  # in mm, at 300 mm from the lens
+
+
+@pytest.mark.parametrize("source", [PlaneWave(), Disc(angle=0.53)])
+@pytest.mark.parametrize("place", ["floor:900", "wall:1500"])
+def test_light_through_a_pane_without_a_picture_goes_straight(place, source):
+    """At the equinox, when the sun moves in a plane, its spot wanders over the floor on a straight line from west to east; anywhere
+    as the ray through the middle, but for the thickness of the pane."""
+    noon, room = moment("2026-03-20T12:20+01:00"), Room()
+    source = replace(source, tilt=LIGHT.tilt(noon))
+    z, tilt, shift = placed(place, room, source.axis, 1)
+    screen = Screen((60.0, 60.0), z, (40, 40), tilt=tilt, shift=shift)
+    scene = Scene(source, Lens((10.0, 10.0), control=(8, 8), offset=Offset(5.0)), screen)
+    heights = torch.full((8, 8), 5.0, dtype=torch.float64)
+    spot = expose(scene, HeightField.of(scene.lens), heights, rays_of(scene, "sobol", 1 << 14)).image.numpy()
+    follower = Follower(scene, HeightField.of(scene.lens), heights, spot, LIGHT, rays=20_000)
+    for minutes in (-90, -20, 2, 60):
+        found = follower.at(noon + timedelta(minutes=minutes)).instant
+        there = np.array([-c for c in room.to_lens(LIGHT.sun(found.time).direction)])
+        place_on = there * np.dot(screen.centre, screen.axes[2]) / np.dot(there, screen.axes[2]) - screen.centre
+        assert found.moved == pytest.approx(np.array(screen.axes[:2]) @ place_on, abs=2.5)
+        if place.startswith("floor"):
+            assert abs(found.moved[1]) < 0.01 * abs(found.moved[0]) + 0.5
+        assert (room.to_room(tuple(place_on))[0] < 0) == (minutes < 0)  # it comes from the other side
 
 
 def test_error_and_light_are_those_of_renders(project, follower):

@@ -9,7 +9,8 @@ import pytest
 from helpers import write_blob
 
 from caustic_cli import cli, load
-from caustic_cli.config.settings import parse
+from caustic_cli.config import settings
+from caustic_cli.config.settings import by_section, parse
 from caustic_cli.errors import InputError
 from caustic_cli.scene.room import Room
 from caustic_cli.scene.screen import tilted
@@ -168,13 +169,27 @@ def test_design_for_the_sun(in_tmp, capfd):
     assert load("p").scene.source.tilt == lens.scene.source.tilt
 
 
+def test_the_sun_is_a_disc(in_tmp):
+    """Unless told otherwise, as wide as it is on that day: in December, near perihelion, at its widest; also in a render of a lens
+    for a plane wave."""
+    assert design("--sun", sun_option(), "--source", "disc") == 0
+    source = load("p").scene.source
+    assert source.kind == "disc" and source.angle == pytest.approx(0.5331 / 0.9838, abs=2e-4)
+    assert source.tilt == pytest.approx(Sunlight(Room(), MUNICH).tilt(moment(NOON)), abs=1e-4)
+    assert design("--sun", sun_option(), "--force") == 0
+    other = load("p", room_time="2026-07-03T13:00+02:00").scene.source
+    assert other.kind == "disc" and other.angle == pytest.approx(0.5331 / 1.0167, abs=2e-4) and other.tilt[0] > 60.0
+    implied = by_section({"room.place": [*MUNICH], "room.time": NOON}), by_section({"lens.size": [10.0, 10.0]})
+    assert [settings.implied(given).get("source") for given in implied] == [{"type": "disc"}, None]
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (("--sun", sun_option("2026-12-21T03:00+01:00")), ("below the horizon", "from 08:04 to 16:20")),
         (("--sun", sun_option(place=(80.0, 0.0))), ("at no time",)),
         (("--sun", sun_option(), "--faces", "0"), ("from behind", "--faces", "at no time")),
-        (("--sun", sun_option("2026-06-21T12:00+01:00"), "--faces", "90"), ("grazes the pane", "from 04:16 to 11:31")),
+        (("--sun", sun_option("2026-06-21T12:00+01:00"), "--faces", "90"), ("grazes the pane", "from 04:16 to 11:30")),
         (("--sun", sun_option("2026-12-21T12:00")), ("offset",)),
         (("--sun", "48.14,11.58"), ("latitude, longitude and time",)),
         (("--sun", sun_option(place=(91.0, 0.0))), ("latitude of -90 to 90",)),

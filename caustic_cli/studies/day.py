@@ -1,4 +1,4 @@
-"""The picture of a lens in a window through a day: where the sun carries it, and how long it is recognised.
+"""The picture of a lens in a window through a day: where the sun carries it, and how long it is legible.
 
 Lens and screen stand still, and the sun moves.  At each time the light is traced to the plane of the screen, and the image looked
 at twice: on the screen where it stands, and on a screen of the same size that is moved in that plane after the picture, to the
@@ -47,8 +47,10 @@ from caustic_cli.studies.retrace import limited_to_source, mean_of, sampler_for
 from caustic_cli.studies.tolerances import best_shift
 
 DAY = Capability("a day of sunlight", {"curved screen": "⟨day⟩ moves a plane screen after its picture, and this one has {}"})
-#: Rays of a time, both halves included; rays that find the median of the light, and points along the coarse surface that they pass.
-RAYS, FINDING, COARSE = 200_000, 4_000, 64
+#: Rays of a time, both halves included, and by how many times fewer match the picture to the target.
+RAYS, MATCHING = 200_000, 8
+#: Rays that find the median of the light, and points along each axis of the coarse surface that they pass.
+FINDING, COARSE = 4_000, 64
 #: Periods of a day, properties of it.
 PERIODS = ("as_designed", "legible", "on_screen")
 #: Steps while the sun shines through the pane, minutes, and most times between them.
@@ -141,7 +143,11 @@ class Follower:
         return self._image * self.scene.source.axis[2]
 
     def at(self, time: datetime) -> Seen:
-        """The picture at a time at which the sun shines through the pane."""
+        """The picture at a time at which the sun shines through the pane.
+
+        Raises:
+            InputError: the light grazes the plane of the screen, or meets it where that reaches the lens.
+        """
         sun, scene = self.light.sun(time), replace(self.scene, source=replace(self.scene.source, tilt=self.light.tilt(time)))
         cosine, landing = scene.source.axis[2], self._landing(scene)
         place = _median(landing)
@@ -167,13 +173,18 @@ class Follower:
         view = scene.screen.grown((pixels[0], pixels[1]))
         if not any(bool(((abs(x) < view.half_size[0]) & (abs(y) < view.half_size[1]) & (w > 0)).any()) for x, y, w in landing):
             return np.zeros((*self.target.shape[:-2], *view.resolution)), None
-        halves = self._halves(scene, view)
         inner = (..., *(slice(n, n + m) for n, m in zip(pixels, scene.screen.resolution, strict=True)))
+        try:
+            halves = self._halves(scene, view)
+        except InputError:  # it reaches the lens, as a floor below a window does
+            halves, around = self._halves(scene, scene.screen), np.zeros((*self.target.shape[:-2], *view.resolution))
+            around[inner] = mean_of(halves).image.cpu().numpy()
+            return around, halves
         return mean_of(halves).image.cpu().numpy(), [replace(half, image=half.image[inner]) for half in halves]
 
     def _followed(self, scene: Scene, at: tuple[float, float]) -> tuple[np.ndarray, tuple[float, float], float, float]:
         """Image on the screen moved after the picture from `at`, mm; by how much; F; and the power there."""
-        first = next(self._images(scene, moved(scene.screen, *at))).image.cpu().numpy()
+        first = next(self._images(scene, moved(scene.screen, *at), self.rays // MATCHING)).image.cpu().numpy()
         if first.sum() > 0:
             grey = (a.sum(0) if a.ndim == 3 else a for a in (first, self.target))
             _, shift = best_shift(*(a / a.mean() for a in grey))
@@ -191,13 +202,14 @@ class Follower:
 
     def _halves(self, scene: Scene, screen: Screen) -> list[Image]:
         """Images on a screen of two independent halves of the rays."""
-        return list(self._images(scene, screen))
+        return list(self._images(scene, screen, self.rays // 2))
 
-    def _images(self, scene: Scene, screen: Screen) -> Iterator[Image]:
+    def _images(self, scene: Scene, screen: Screen, rays: int) -> Iterator[Image]:
+        """Independent images of so many rays each."""
         one, heights = scene.onto(screen), self.heights.to(self.device)
         for k in (0, 1):
-            rays = sampler_for(one.batch(k, 2), max(1, self.rays // 2), stream(self.seed, f"day {k}"), self.device)
-            yield limited_to_source(expose(one, self.field, heights, rays))
+            sampler = sampler_for(one.batch(k, 2), max(1, rays), stream(self.seed, f"day {k}"), self.device)
+            yield limited_to_source(expose(one, self.field, heights, sampler))
 
     def _landing(self, scene: Scene) -> Landing:
         """Landing points of rays through the coarse surface."""
@@ -292,17 +304,26 @@ def follow_day(
     progress: Callable[[str, int, int], None] = lambda what, done, whole: None,
 ) -> tuple[Day, list[T]]:
     """The hours of sun of a day in steps of STEP minutes, and in shorter ones while light is on the screen and where the picture
-    becomes legible; and what `keep` makes of what is seen at each time."""
+    becomes legible, as far as the light meets the plane of the screen; and what `keep` makes of what is seen at each time.
+
+    Raises:
+        InputError: it never does.
+    """
     found: dict[datetime, tuple[Instant, T]] = {}
 
     def look(times: Iterable[datetime], why: str) -> None:
         todo = [t for t in times if t not in found]
         for k, time in enumerate(todo):
             progress(f"{why}, {time:%H:%M}", k, len(todo))
-            seen = follower.at(time)
+            try:
+                seen = follower.at(time)
+            except InputError:  # there is no picture in the plane of the screen
+                continue
             found[time] = seen.instant, keep(seen)
 
     look(_every(shines, STEP), "the sun's day")
+    if not found:
+        raise InputError("⟨day⟩ needs light on the plane of the screen, and there is none at any time of that day")
     look(_between(Day(follower.error, follower.bounds, _sorted(found)), shines), "while the picture is on the screen")
     return Day(follower.error, follower.bounds, _sorted(found)), [found[time][1] for time in sorted(found)]
 
