@@ -57,6 +57,8 @@ PERIODS = ("as_designed", "legible", "on_screen")
 STEP, MOST_BETWEEN = 5, 160
 #: Bound of a picture that is as designed; of a legible one, part of C; and the part of it that is on the screen.
 FACTOR, MORE, CONTRAST, PART = 1.5, 0.05, 0.5, 0.5
+#: Least part of the picture's power on the screen where it stands by which that is judged.
+LEAST = 0.01
 #: Width of the view of the screen's plane, in screens.
 AROUND = 3
 #: Rays that a displayed pixel is averaged over, in a Gaussian.
@@ -76,7 +78,7 @@ class Instant:
     azimuth: float
     elevation: float
     incidence: float
-    #: F on the screen where it stands, None without light there; and after following the picture.
+    #: F on the screen where it stands, None with hardly any light there; and after following the picture.
     error: float | None
     followed: float
     #: By how much the picture has moved along the screen's x and y since the light of the design, mm.
@@ -159,7 +161,7 @@ class Follower:
             sun.azimuth,
             sun.elevation,
             float(np.degrees(np.arccos(min(1.0, cosine)))),
-            self._error(still) if still is not None and lands > 0 else None,
+            self._error(still) if still is not None and lands > LEAST * whole else None,
             followed,
             (at[0] - self.offset[0], at[1] - self.offset[1]),
             self._on_picture(image) * cosine / self._power if self._power else 0.0,
