@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
-from caustic_cli.config.settings import Settings, build_source
+from caustic_cli.config.settings import FIRST, Settings, build_source
 from caustic_cli.errors import InputError, alternatives
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.loading import OnDemand
@@ -49,11 +49,12 @@ def sunlight(room: RoomSettings) -> tuple[Any, datetime]:
             "[room] needs ⟨+room.place⟩, a place on earth and a time: without the sun, ⟨room.faces⟩ and ⟨room.slope⟩ have no use"
         )
     pane, place = rooms.Room(room.faces, room.slope), check("room.place", room.place)
-    return sunlights.Sunlight(pane, place), sunlights.moment(room.time)
+    return sunlights.Sunlight(pane, place), sunlights.moment(room.time.partition("/")[0])
 
 
-def complete_sunlight(source: SourceSettings, room: RoomSettings | None) -> SourceSettings:
-    """The source with the direction of the sun's light, and with the sun's width if it has one, where they are not given.
+def complete_sunlight(source: SourceSettings, room: RoomSettings | None, array: tuple[int, int] = (1, 1)) -> SourceSettings:
+    """The source with the direction of the sun's light, and with the sun's width if it has one, where they are not given; for an
+    interval of time one for each lenslet of an array, in their order.
 
     Raises:
         InputError: there is no sunlight at that time, the source cannot be the sun, or has another direction.
@@ -65,7 +66,25 @@ def complete_sunlight(source: SourceSettings, room: RoomSettings | None) -> Sour
         raise InputError(
             f"⟨room.place⟩ needs ⟨source⟩ {alternatives(sources.used_by('tilt'))}, light from infinity, got {type.name}"
         )
-    light, time = sunlight(room)
+    light, _ = sunlight(room)
+    times = sunlights.instants(room.time, math.prod(array))
+    if len(times) == 1:
+        return _of_sun(source, type, light, times[0])
+    if source.also and len(source.also) != len(times) - 1:
+        raise InputError(f"⟨source.also⟩: the sun of {len(times)} lenslets has as many [[source]], got {len(source.also) + 1}")
+    (n, m), first = array, source.without("also")
+    each = [first, *(source.also or [first.without(*FIRST)] * (len(times) - 1))]
+    read = [times[(m - 1 - j) * n + i] for i in range(n) for j in range(m)]  # as the pictures of a sheet are read, row by row
+    lit = [_of_sun(one, type, light, time) for one, time in zip(each, read, strict=True)]
+    return lit[0].changed(also=lit[1:])
+
+
+def _of_sun(source: SourceSettings, type: Any, light: Any, time: datetime) -> SourceSettings:
+    """A source with the direction and the width of the sun at a time, where they are not given.
+
+    Raises:
+        InputError: there is no sunlight, or the source has another direction.
+    """
     light.check(time)
     tilt = [round(angle, ANGLE_DECIMALS) for angle in light.tilt(time)]
     given = check("source.tilt", source.tilt) if "tilt" in source else tilt

@@ -8,7 +8,8 @@ Notation
              neighbours share the ones on their border
     h_ij     height offset (piston) of a lenslet, mm
 
-In the frame of lenslet i, j the screen is shifted by -c_ij; all else is the same.  The landing points of collimated light do not
+In the frame of lenslet i, j the screen is shifted by -c_ij, and of sources that shine in turn it has its own; all else is the same.
+The landing points of collimated light do not
 depend on a height offset, so the h_ij are chosen to make borders meet: they minimise the sum over all borders of the mean square
 step between the control points on both sides.  The remaining steps, at most `AssembledArray.gap`, are averaged.  The surface may
 have a crease along a border: borders are knots of multiplicity p (`bspline.open_knots`), so that the control points of a lenslet
@@ -70,11 +71,11 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
     steps = [(n - 1) // k for n, k in zip(control or lens.control, lens.array, strict=True)]
     size = (lens.size[0] / lens.array[0], lens.size[1] / lens.array[1])
     own = replace(lens, size=size, control=(steps[0] + 1, steps[1] + 1), array=(1, 1))
-    light, found = _light(scene.source.profile, lens.array), []
+    light, found, hours = _light(scene.source.profile, lens.array), [], scene.source.in_turn
     for i in range(lens.array[0]):
         for j in range(lens.array[1]):
             middle = [((k + 0.5) / n - 0.5) * w for k, n, w in zip((i, j), lens.array, lens.size, strict=True)]
-            part, source = light[i][j], scene.source
+            part, source = light[i][j], scene.source.members[i * lens.array[1] + j] if hours else scene.source
             if not part.sum() > 0:
                 raise InputError(f"⟨source.profile⟩ leaves lenslet {i}, {j} dark; each needs some light")
             if source.profile is not None:

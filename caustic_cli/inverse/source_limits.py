@@ -41,7 +41,7 @@ LIMITS = Capability(
 CONVOLUTION = Capability(
     "design by convolution with the source",
     {
-        "separate places": "its places have images of their own",
+        **dict.fromkeys(("separate places", "several sources"), "its places have images of their own"),
         "curved screen": "the image of the source varies over the screen",
         **dict.fromkeys(("other elements", "folded axis"), "the blur by the lens alone is not that on the screen"),
     },

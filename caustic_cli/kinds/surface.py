@@ -177,6 +177,11 @@ class OneSurface(Problem):
         Raises:
             InputError: there is one.
         """
+        if d.source.in_turn and len(d.source.members) != (count := math.prod(d.lens.array)):
+            raise InputError(
+                f"⟨source.tilt⟩ of several sources is for an array of as many lenslets, each for one of them: got"
+                f" {len(d.source.members)} sources and {count} lenslets"
+            )
         if d.design.start != "offset" and d.trained and not relative_to_initial(d.design):
             raise InputError(
                 f"⟨design.start⟩ {d.design['start']} gives a surface, from which a network can start only with"

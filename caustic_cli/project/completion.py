@@ -58,7 +58,7 @@ def complete(
     """
     s, by = Settings.of(given), by or Parameters()
     room, s = s.room, s.changed(room=lit_by_sun(s.room, by))
-    s = s.changed(source=complete_sunlight(s.source, s.room))
+    s = s.changed(source=complete_sunlight(s.source, s.room, check("lens.array", s.lens.array)))
     refuse_contradictions(s)
     if s.target.sheet:
         aspect, lit = _aspect_of_a_sheet(s, aspect), (1.0, 1.0)

@@ -173,9 +173,10 @@ class Project:
         s = self.settings
         other, room = _other_source(s.source, own.get("source", {})), self.room(given)
         if "room" in own:  # another light of the sun
-            other = {key: value for key, value in other.items() if key not in {"tilt", "angle"} - own.get("source", {}).keys()}
+            stale = {"tilt", "angle", "also"} - own.get("source", {}).keys()
+            other = {key: value for key, value in other.items() if key not in stale}
         if room is not None and ("room" in own or "tilt" not in own.get("source", {})):
-            other = dict(complete_sunlight(SourceSettings(other), room))
+            other = dict(complete_sunlight(SourceSettings(other), room, s.lens.array))
         settings.refuse_unused(other, given)
         # Further conditions of a design on its source do not apply to an image.
         if s.target.color:

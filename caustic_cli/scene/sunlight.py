@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date, datetime, time, timedelta, tzinfo
@@ -16,6 +17,8 @@ Hours = list[tuple[datetime, datetime]]
 
 #: Years in which the sun is where `sun` says to about 0.01 degrees.
 YEARS = (1900, 2100)
+#: The offset at the end of a time.
+OFFSET = re.compile(r"(Z|[+-][0-9:]+)$")
 MINUTES = 24 * 60
 
 
@@ -35,6 +38,29 @@ def moment(text: str, where: str = "⟨room.time⟩") -> datetime:
     if not YEARS[0] <= found.year < YEARS[1]:
         raise InputError(f"{where} must be in the years {YEARS[0]} to {YEARS[1] - 1}, got {text!r}")
     return found
+
+
+def instants(text: str, count: int) -> list[datetime]:
+    """The time that a text gives; of an interval START/END, `count` of them at equal distances, both ends included.
+
+    The end may be a time of the start's day, with its offset: 2026-06-21T10:00+02:00/16:00.
+
+    Raises:
+        InputError: as of `moment`, the interval is empty, or a single time of it is asked for.
+    """
+    first, slash, last = (part.strip() for part in text.partition("/"))
+    start = moment(first)
+    if not slash:
+        return [start]
+    zone = start.isoformat()[19:]
+    end = moment(last if "T" in last or " " in last else f"{start.date()}T{last}{'' if OFFSET.search(last) else zone}")
+    if count < 2:
+        raise InputError(
+            "⟨room.time⟩ as an interval is for a sundial, a lens for every hour: it needs ⟨+lens.array⟩ and ⟨+target.sheet⟩"
+        )
+    if end <= start:
+        raise InputError(f"⟨room.time⟩ must end after it begins, got {text!r}")
+    return [start + k * (end - start) / (count - 1) for k in range(count)]
 
 
 @dataclass(frozen=True)

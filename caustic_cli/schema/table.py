@@ -262,7 +262,8 @@ class RoomSettings(Section):
     section = "room"
     place: Pair | None = setting("latitude to the north and longitude to the east", "degrees", -180.0, 180.0,
             option=Option("--sun", "LAT,LON,TIME", BOTH), speaks_for=("room.time",))
-    time: str | None = setting("date and time with its offset from UTC (ISO 8601), like 2026-06-21T12:00+02:00")
+    time: str | None = setting("date and time with its offset from UTC (ISO 8601), like 2026-06-21T12:00+02:00; of a sundial an"
+            " interval, like 2026-06-21T11:00+02:00/13:00, divided evenly among its lenslets, row by row as a sheet is read")
     faces: float = setting("azimuth to which the outer side of the pane looks, clockwise from north", "degrees", -360.0, 360.0,
             default=180.0, why="a south window", option=Option("--faces", "AZIMUTH", BOTH))
     slope: float = setting("angle between pane and horizontal: 90 for an upright window, 0 for a skylight", "degrees", 0.0, 180.0,

@@ -99,6 +99,11 @@ class Source:
         return self.distant and any(self.tilt)
 
     @property
+    def in_turn(self) -> bool:
+        """Whether it is several sources that shine one after another, each for a lenslet of its own."""
+        return False
+
+    @property
     def half_angle(self) -> float:
         """Largest angle of a distant source's rays to its axis."""
         return 0.0

@@ -72,6 +72,31 @@ class Several(Source):
         return all(member.distant for member in self.members)
 
     @property
+    def axis(self) -> tuple[float, float, float]:  # type: ignore[override]  # a property instead of an attribute
+        """Mean direction of the light of sources at infinity, weighted by power."""
+        if not self.distant:
+            return super().axis
+        mean = np.average([member.axis for member in self.members], axis=0, weights=[member.power for member in self.members])
+        x, y, z = (mean / np.linalg.norm(mean)).tolist()
+        return x, y, z
+
+    @property
+    def tilt(self) -> tuple[float, float]:  # type: ignore[override]
+        """That of the mean direction."""
+        x, y, z = self.axis
+        return (math.degrees(-math.asin(y)), math.degrees(math.atan2(x, z))) if self.oblique else (0.0, 0.0)
+
+    @property
+    def oblique(self) -> bool:
+        """Whether the light of one is."""
+        return any(member.oblique for member in self.members)
+
+    @property
+    def in_turn(self) -> bool:
+        """Whether they shine one after another, as the sun at several times: at infinity, not all in the direction of z."""
+        return self.distant and self.oblique
+
+    @property
     def half_angle(self) -> float:
         """The largest."""
         return max(member.half_angle for member in self.members)
@@ -125,7 +150,7 @@ class Several(Source):
 
     def extent_words(self, z_in: float) -> str:
         """As of a source."""
-        return f"{len(self.members)} sources shine at once"
+        return f"{len(self.members)} sources shine {'in turn' if self.in_turn else 'at once'}"
 
     def pointlike(self) -> Source:
         """Each without its extent."""

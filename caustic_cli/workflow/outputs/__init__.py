@@ -9,6 +9,7 @@ from caustic_cli.workflow.outputs.base import Output
 from caustic_cli.workflow.outputs.cut import MachinedSurface
 from caustic_cli.workflow.outputs.day import DayOfSunlight
 from caustic_cli.workflow.outputs.explanation import Explanation
+from caustic_cli.workflow.outputs.hours import Hours
 from caustic_cli.workflow.outputs.illumination import Illumination
 from caustic_cli.workflow.outputs.image import RayPicture
 from caustic_cli.workflow.outputs.page import InteractivePage
@@ -23,6 +24,7 @@ from caustic_cli.workflow.outputs.waves import WavePicture
 OUTPUTS: tuple[type[Output], ...] = (
     RayPicture,
     SecondPicture,
+    Hours,
     WavePicture,
     PixelValues,
     MachinedSurface,
