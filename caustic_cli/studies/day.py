@@ -46,7 +46,13 @@ from caustic_cli.studies.noise import variance_of
 from caustic_cli.studies.retrace import limited_to_source, mean_of, sampler_for
 from caustic_cli.studies.tolerances import best_shift
 
-DAY = Capability("a day of sunlight", {"curved screen": "⟨day⟩ moves a plane screen after its picture, and this one has {}"})
+DAY = Capability(
+    "a day of sunlight",
+    {
+        "curved screen": "⟨day⟩ moves a plane screen after its picture, and this scene has {}",
+        "several sources": "⟨day⟩ follows one sun, and this scene has {}; ⟨+room.place⟩ with a single time gives it one",
+    },
+)
 #: Rays of a time, both halves included, and by how many times fewer match the picture to the target.
 RAYS, MATCHING = 200_000, 8
 #: Rays that find the median of the light, and points along each axis of the coarse surface that they pass.
