@@ -18,11 +18,11 @@ from caustic_cli.scene import Screen
 class Exit(NamedTuple):
     """The exit surface and the screen behind it.
 
-    index: ratio of the indices in front of and behind it; fresnel: kind of Fresnel losses, as in `refraction`; start: height
+    eta: ratio of the indices in front of and behind it; fresnel: kind of Fresnel losses, as in `refraction`; start: height
     of the origins of oblique rays, height: of the screen, mm, both above the zero of the sag.
     """
 
-    index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
+    eta: float
     fresnel: int
     start: float
     height: float
@@ -47,14 +47,14 @@ class ScreenFrame(NamedTuple):
 class Point(NamedTuple):
     """A source point behind the flat entrance, for the rays of `pencil`.
 
-    x, y: mm; distance: h, mm; index: n of the entrance; steps: of Newton's iteration; scale: 2 / largest s; emission: coefficients
+    x, y: mm; distance: h, mm; n: index of the entrance; steps: of Newton's iteration; scale: 2 / largest s; emission: coefficients
     of J, the highest first; see `optics.pencil`.
     """
 
     x: float
     y: float
     distance: float
-    index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
+    n: float
     steps: int
     scale: float
     emission: np.ndarray

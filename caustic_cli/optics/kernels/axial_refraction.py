@@ -68,7 +68,7 @@ def _arrive(sag, height, out):
 @njit(inline="always", **FAST)
 def aim(v, exit_, frame):
     """Powers and landing points of a row of rays along z, from SAG, GX, GY, FLUX, X and Y."""
-    n, height, fresnel = exit_.index, exit_.height, exit_.fresnel
+    n, height, fresnel = exit_.eta, exit_.height, exit_.fresnel
     _powers(fresnel, v[row.GX], v[row.GY], v[row.FLUX], n, v[row.POWER])
     _reach(v[row.SAG], v[row.GX], v[row.GY], n, height, v[row.REACH])
     _landing(v[row.REACH], v[row.GX], v[row.X], frame.low_x, frame.pixel_x, v[row.PX])
@@ -104,7 +104,7 @@ def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
 @njit(inline="always", **FAST)
 def pull(vectors, exit_):
     """Adjoint: derivatives by sag and slopes, in BY_SAG, BY_GX, BY_GY, from those by power and pixel coordinates."""
-    n, height, v = exit_.index, exit_.height, vectors
+    n, height, v = exit_.eta, exit_.height, vectors
     sag, gx, gy, flux, by_px, by_py = v[row.SAG], v[row.GX], v[row.GY], v[row.FLUX], v[row.BY_PX], v[row.BY_PY]
     _by_a(exit_.fresnel, sag, gx, gy, flux, v[row.BY_POWER], by_px, by_py, n, height, v[row.BY_A])
     _by_slope(v[row.REACH], gx, by_px, v[row.BY_A], v[row.BY_GX])

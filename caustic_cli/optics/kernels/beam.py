@@ -52,7 +52,7 @@ def _along(gamma, zx, zy, n, e, on):
 
 @njit(inline="always", **FAST)
 def _aim(w, count, exit_, frame, beam):
-    n, e1, e2, e3 = exit_.index, beam.e1, beam.e2, beam.e3
+    n, e1, e2, e3 = exit_.eta, beam.e1, beam.e2, beam.e3
     for j in range(count):
         x, y, z, zx, zy = w[X, j], w[Y, j], w[Z, j], w[ZX, j], w[ZY, j]
         norm2, m, s, lit, passes = _bend(w, j, beam, n, exit_.start)
@@ -102,7 +102,7 @@ def aim(v, i, rays, exit_, frame, beam):
 
 @njit(inline="always", **FAST)
 def _pull(w, count, exit_, beam):
-    n, e1, e2, e3, long2 = exit_.index, beam.e1, beam.e2, beam.e3, beam.long2
+    n, e1, e2, e3, long2 = exit_.eta, beam.e1, beam.e2, beam.e3, beam.long2
     for j in range(count):
         x, y, z, zx, zy = w[X, j], w[Y, j], w[Z, j], w[ZX, j], w[ZY, j]
         norm2, m, s, lit, passes = _bend(w, j, beam, n, exit_.start)

@@ -40,7 +40,7 @@ def _path(z, tz, height):
 @njit(inline="always", **FAST)
 def aim_batch(w, count, exit_, frame):
     """Powers and landing points, in pixels."""
-    n, fresnel, begin, height = exit_.index, exit_.fresnel, exit_.start, exit_.height
+    n, fresnel, begin, height = exit_.eta, exit_.fresnel, exit_.start, exit_.height
     over_x, over_y, low_x, low_y = 1.0 / frame.pixel_x, 1.0 / frame.pixel_y, frame.low_x, frame.low_y
     for j in range(count):
         t, gx, gy, dx, dy = w[REACH, j], w[GX, j], w[GY, j], w[DX, j], w[DY, j]
@@ -56,7 +56,7 @@ def aim_batch(w, count, exit_, frame):
 @njit(inline="always", **FAST)
 def pull_batch(w, count, exit_):
     """Derivatives by distances and slopes, from those by powers and landing points, per mm."""
-    n, fresnel, begin, height = exit_.index, exit_.fresnel, exit_.start, exit_.height
+    n, fresnel, begin, height = exit_.eta, exit_.fresnel, exit_.start, exit_.height
     for j in range(count):
         t, gx, gy, dx, dy, power, by_power = w[REACH, j], w[GX, j], w[GY, j], w[DX, j], w[DY, j], w[P, j], w[POWER, j]
         dz = math.sqrt(max(1.0 - dx * dx - dy * dy, 0.0))

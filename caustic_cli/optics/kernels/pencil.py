@@ -36,7 +36,7 @@ def _slope(q, z, u, h, n):
 @njit(inline="always", **FAST)
 def _cross(w, count, x, depth, point):
     """u of a batch, by Newton steps from the paraxial value, from which they increase to the root."""
-    h, n = point.distance, point.index
+    h, n = point.distance, point.n
     for j in range(count):
         w[U, j] = n / (n * h + depth + w[Z, j])
     for _ in range(point.steps):
@@ -66,7 +66,7 @@ def _bend(w, j, x, depth, point, n):
     """Of ray j: q, z, c, dF/du, k, L^2, M, |N|^2, S, and whether it passes (S is 1 where it does not)."""
     y, zx, zy = w[Y, j], w[ZX, j], w[ZY, j]
     q, z = x * x + y * y, depth + w[Z, j]
-    c, by_u = _slope(q, z, w[U, j], point.distance, point.index)
+    c, by_u = _slope(q, z, w[U, j], point.distance, point.n)
     k = w[U, j] * c
     long2, norm2 = 1.0 + k * k * q, 1.0 + zx * zx + zy * zy
     m = 1.0 - k * (x * zx + y * zy)
@@ -77,7 +77,7 @@ def _bend(w, j, x, depth, point, n):
 
 @njit(inline="always", **FAST)
 def _aim(w, count, x, point, exit_, frame):
-    n, height, fresnel, depth = exit_.index, exit_.height, exit_.fresnel, -exit_.start
+    n, height, fresnel, depth = exit_.eta, exit_.height, exit_.fresnel, -exit_.start
     over_x, over_y = 1.0 / frame.pixel_x, 1.0 / frame.pixel_y
     for j in range(count):
         _, _, _, by_u, k, long2, m, norm2, s, passes = _bend(w, j, x, depth, point, n)
@@ -127,7 +127,7 @@ def aim(v, i, rays, exit_, frame, point):
 
 @njit(inline="always", **FAST)
 def _pull(w, count, x, point, exit_):
-    n, height, fresnel, depth, ratio2 = exit_.index, exit_.height, exit_.fresnel, -exit_.start, point.index * point.index
+    n, height, fresnel, depth, ratio2 = exit_.eta, exit_.height, exit_.fresnel, -exit_.start, point.n * point.n
     for j in range(count):
         y, zx, zy, u = w[Y, j], w[ZX, j], w[ZY, j], w[U, j]
         q, z, c, by_u, k, long2, m, norm2, s, passes = _bend(w, j, x, depth, point, n)

@@ -41,7 +41,7 @@ VECTORS, MISSED_POWER = row.VECTORS + row.SCRATCH, row.MISSED_POWER
 class Setting(NamedTuple):
     """Scalar arguments of a kernel: index and kind of Fresnel losses, as of an `Exit`, a `ScreenFrame`, and alpha of the filter."""
 
-    index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
+    eta: float
     fresnel: int
     frame: ScreenFrame
     alpha_x: float
@@ -128,7 +128,7 @@ def _kernels(form: str, kind: int, vx: int, vy: int):
         v, w = cuda.local.array((VECTORS, 1), float64), cuda.local.array((w_rows, 1), float64)
         sx, sy, none = cuda.local.array((vx, 1), float64), cuda.local.array((vy, 1), float64), cuda.local.array((1, 1), float64)
         own, block = cuda.local.array(COLUMNS, int64), cuda.shared.array(COLUMNS, int64)
-        exit_, frame = Exit(setting.index, setting.fresnel, place[0], place[1]), setting.frame
+        exit_, frame = Exit(setting.eta, setting.fresnel, place[0], place[1]), setting.frame
         splat, scale = Splat(kind, vx, vy, setting.alpha_x, setting.alpha_y), unit[0]
         for c in range(COLUMNS):
             own[c] = 0
@@ -167,7 +167,7 @@ def _kernels(form: str, kind: int, vx: int, vy: int):
         sx, dx = cuda.local.array((vx, 1), float64), cuda.local.array((vx, 1), float64)
         sy, dy = cuda.local.array((vy, 1), float64), cuda.local.array((vy, 1), float64)
         column, tilt = cuda.local.array(room, float64), cuda.local.array(room, float64)
-        exit_, frame = Exit(setting.index, setting.fresnel, place[0], place[1]), setting.frame
+        exit_, frame = Exit(setting.eta, setting.fresnel, place[0], place[1]), setting.frame
         splat = Splat(kind, vx, vy, setting.alpha_x, setting.alpha_y)
         for b in range(room):
             column[b], tilt[b] = 0.0, 0.0
