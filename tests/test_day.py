@@ -118,10 +118,10 @@ def test_error_and_light_are_those_of_renders(project, follower):
 def test_periods():
     """Times are as designed, legible, and legible on the screen by their own bounds; each period ends where one is not."""
 
-    def at(minute: int, followed: float, on_screen: float) -> Instant:
-        return Instant(NOON + timedelta(minutes=minute), 180.0, 20.0, 20.0, None, followed, (0.0, 0.0), 1.0, on_screen)
+    def at(minute: int, followed: float, on_screen: float, brightness: float = 1.0) -> Instant:
+        return Instant(NOON + timedelta(minutes=minute), 180.0, 20.0, 20.0, None, followed, (0.0, 0.0), brightness, on_screen)
 
-    rows = [(0, 0.9, 1.0), (1, 0.4, 0.2), (2, 0.1, 1.0), (3, 0.4, 1.0), (4, 0.6, 1.0), (5, 0.1, 0.6)]
+    rows = [(0, 0.9, 1.0), (1, 0.4, 0.2), (2, 0.1, 1.0), (3, 0.4, 1.0), (4, 0.6, 1.0), (5, 0.1, 0.6), (6, 0.1, 1.0, 0.05)]
     day = Day(0.1, (0.2, 0.5), tuple(at(*row) for row in rows))
     minutes = lambda periods: [((a - NOON).seconds // 60, (b - NOON).seconds // 60) for a, b in periods]  # noqa: E731
     assert minutes(day.as_designed) == [(2, 2), (5, 5)]

@@ -130,4 +130,5 @@ def hours(holds: Callable[[datetime], bool], day: date, zone: tzinfo | None) -> 
 def in_words(periods: Hours) -> str:
     """Periods within a day, such as "from 08:12 to 17:40"."""
     said = [f"from {a:%H:%M} to {b:%H:%M}" for a, b in periods if b - a < timedelta(minutes=MINUTES - 1)]
-    return " and ".join(said) or ("all day" if periods else "at no time")
+    words = " and ".join(filter(None, (", ".join(said[:-1]), *said[-1:])))
+    return words or ("all day" if periods else "at no time")

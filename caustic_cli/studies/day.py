@@ -8,8 +8,9 @@ Notation
     F           relative RMS error against the target, of two independent halves of the rays, corrected for their noise
     F_0, P_0    error and power on the picture under the light for which the lens is designed
     C           contrast of the target, its standard deviation over its mean: F of an even grey
-    as designed F <= FACTOR F_0 + MORE after following
-    legible     F <= C / 2 after following, three quarters of the variance of its pixels being the picture's; or as designed
+    as designed F <= FACTOR F_0 + MORE after following, with a power on the picture of at least DIM P_0
+    legible     F <= C / 2 after following, three quarters of the variance of its pixels being the picture's, with the same power;
+                or as designed
     on screen   legible, and at least PART of the power of the followed picture still lands on the screen where it stands
 
 Powers are those of a beam of constant irradiance across it, of which the pane receives the cosine of its incidence: air, which
@@ -46,7 +47,13 @@ from caustic_cli.studies.noise import variance_of
 from caustic_cli.studies.retrace import limited_to_source, mean_of, sampler_for
 from caustic_cli.studies.tolerances import best_shift
 
-DAY = Capability("a day of sunlight", {"curved screen": "⟨day⟩ moves a plane screen after its picture, and this one has {}"})
+DAY = Capability(
+    "a day of sunlight",
+    {
+        "curved screen": "⟨day⟩ moves a plane screen after its picture, and this scene has {}",
+        "several sources": "⟨day⟩ follows one sun, and this scene has {}; ⟨+room.place⟩ with a single time gives it one",
+    },
+)
 #: Rays of a time, both halves included, and by how many times fewer match the picture to the target.
 RAYS, MATCHING = 200_000, 8
 #: Rays that find the median of the light, and points along each axis of the coarse surface that they pass.
@@ -55,8 +62,11 @@ FINDING, COARSE = 4_000, 64
 PERIODS = ("as_designed", "legible", "on_screen")
 #: Steps while the sun shines through the pane, minutes, and most times between them.
 STEP, MOST_BETWEEN = 5, 160
-#: Bound of a picture that is as designed; of a legible one, part of C; and the part of it that is on the screen.
-FACTOR, MORE, CONTRAST, PART = 1.5, 0.05, 0.5, 0.5
+#: Bound of a picture that is as designed; of a legible one, part of C; its least brightness; and the part of it that is on the
+#: screen.
+FACTOR, MORE, CONTRAST, DIM, PART = 1.5, 0.05, 0.5, 0.1, 0.5
+#: Least part of the picture's power on the screen where it stands by which that is judged.
+LEAST = 0.01
 #: Width of the view of the screen's plane, in screens.
 AROUND = 3
 #: Rays that a displayed pixel is averaged over, in a Gaussian.
@@ -76,7 +86,7 @@ class Instant:
     azimuth: float
     elevation: float
     incidence: float
-    #: F on the screen where it stands, None without light there; and after following the picture.
+    #: F on the screen where it stands, None with hardly any light there; and after following the picture.
     error: float | None
     followed: float
     #: By how much the picture has moved along the screen's x and y since the light of the design, mm.
@@ -84,6 +94,10 @@ class Instant:
     #: Power on the picture over P_0; part of the power of the followed picture's screen that is on that where it stands.
     brightness: float
     on_screen: float
+
+    def within(self, bound: float) -> bool:
+        """Whether the picture is bright enough, and its F after following within a bound."""
+        return self.followed <= bound and self.brightness >= DIM
 
 
 @dataclass(frozen=True)
@@ -159,7 +173,7 @@ class Follower:
             sun.azimuth,
             sun.elevation,
             float(np.degrees(np.arccos(min(1.0, cosine)))),
-            self._error(still) if still is not None and lands > 0 else None,
+            self._error(still) if still is not None and lands > LEAST * whole else None,
             followed,
             (at[0] - self.offset[0], at[1] - self.offset[1]),
             self._on_picture(image) * cosine / self._power if self._power else 0.0,
@@ -247,17 +261,17 @@ class Day:
     @property
     def as_designed(self) -> Hours:
         """When the picture is as designed, wherever it is."""
-        return self._periods(lambda i: i.followed <= self.bounds[0])
+        return self._periods(lambda i: i.within(self.bounds[0]))
 
     @property
     def legible(self) -> Hours:
         """When it is legible, wherever it is."""
-        return self._periods(lambda i: i.followed <= self.bounds[1])
+        return self._periods(lambda i: i.within(self.bounds[1]))
 
     @property
     def on_screen(self) -> Hours:
         """When it is legible on the screen where it stands."""
-        return self._periods(lambda i: i.followed <= self.bounds[1] and i.on_screen >= PART)
+        return self._periods(lambda i: i.within(self.bounds[1]) and i.on_screen >= PART)
 
     def _periods(self, holds: Callable[[Instant], bool]) -> Hours:
         """First and last time of each run of instants for which something holds."""
@@ -336,7 +350,7 @@ def _between(day: Day, shines: Hours) -> list[datetime]:
     """Minutes at which light falls on the screen, and those between times of which one is as designed, or legible, only."""
     near = [(i.time, i.time) for i in day.instants if i.on_screen > 0.0]
     for a, b in pairwise(day.instants):
-        if any((a.followed <= bound) != (b.followed <= bound) for bound in day.bounds):
+        if any(a.within(bound) != b.within(bound) for bound in day.bounds):
             near.append((a.time, b.time))
     step = timedelta(minutes=STEP)
     minutes = [t for t in _every(shines, 1) if any(a - step < t < b + step if a == b else a < t < b for a, b in near)]
@@ -356,18 +370,16 @@ def rows(figures: dict[str, Any]) -> list[tuple[str, str]]:
     """The figures as rows of a table (name, text)."""
     times = figures["times"]
     said = {name: in_words([_read(*period) for period in figures[name]]) for name in PERIODS}
-    shown = [row for row in times if row["followed_error"] <= figures["legible_error"]]
+    ends = [figures["legible"][0][0], figures["legible"][-1][1]] if figures["legible"] else []
     table = [
         ("sun through the pane", f"{in_words([_read(times[0]['time'], times[-1]['time'])])}, looked at {len(times)} times"),
         ("as designed", f"{said['as_designed']}: error {figures['error']:.3f}, at most {figures['as_designed_error']:.3f}"),
         ("legible", f"{said['legible']}: error at most {figures['legible_error']:.3f}"),
         ("legible on the screen", f"{said['on_screen']}: at least {PART:.0%} of it lands there"),
     ]
-    for word, row in zip(("first", "last"), (shown[:1], shown[-1:]), strict=True):
-        table += [
-            (f"when {word} legible", f"{one['moved'][0]:+.1f}, {one['moved'][1]:+.1f} mm away, brightness {one['brightness']:.2f}")
-            for one in row
-        ]
+    for word, end in zip(("first", "last"), ends, strict=False):
+        (x, y), brightness = next((row["moved"], row["brightness"]) for row in times if row["time"] == end)
+        table.append((f"when {word} legible", f"{x:+.1f}, {y:+.1f} mm away, brightness {brightness:.2f}"))
     return table
 
 
@@ -404,7 +416,7 @@ def write_plot(path: Path, day: Day) -> None:
     for axis, colour in zip((0, 1), COLOURS[:2], strict=True):
         place.plot(times, [i.moved[axis] for i in day.instants], color=colour, label=f"along the screen's {'xy'[axis]}")
     place.set_ylabel("displacement (mm)")
-    reach = max((max(map(abs, i.moved)) for i in day.instants if i.followed <= day.bounds[1]), default=0.0)
+    reach = max((max(map(abs, i.moved)) for i in day.instants if i.within(day.bounds[1])), default=0.0)
     if reach:
         place.set_ylim(-1.5 * reach, 1.5 * reach)
     light.plot(times, [i.brightness for i in day.instants], color=COLOURS[0], label="power on the picture, over that of the design")

@@ -114,7 +114,7 @@ def _frame(follower: study.Follower, encoding: str, seen: study.Seen) -> Image.I
     both = Image.new("RGB", (wall.width + 8 + picture.width, HEIGHT), (40, 40, 40))
     both.paste(wall, (0, 0))
     both.paste(picture, (wall.width + 8, 0))
-    legible = "" if i.followed <= follower.bounds[1] else ", not legible"
+    legible = "" if i.within(follower.bounds[1]) else ", not legible"
     place = f"{i.moved[0]:+.1f}, {i.moved[1]:+.1f} mm"
     return captioned(
         both,
