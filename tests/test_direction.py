@@ -332,7 +332,6 @@ def test_design_and_render(in_tmp, capfd, mirror):
     [
         (("--source-tilt", "85,0"), "-80 to 80"),
         (("--source-tilt", "70,60"), "within 80 degrees"),
-        (("--source-tilt", "20,0", "--array", "2"), "one lens with a flat entrance"),
         (("--source-tilt", "20,0", "--robust", "t.toml"), "--robust"),
         (("--source-tilt", "20,0", "--source", "point"), "tilt"),
         (("--source-tilt", "20,0", "--source", "disc"), "disc with an angle"),
