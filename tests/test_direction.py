@@ -1,4 +1,5 @@
-"""Plane waves from any direction: kernel, energy, start, wave image and screen, each against an independent way."""
+"""Plane waves from any direction, through lenses and off mirrors: kernel, energy, start, wave image and screen, each against an
+independent way."""
 
 import json
 import math
@@ -14,6 +15,7 @@ from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.inverse.initial_surface import first_surface
+from caustic_cli.inverse.projection import BeamProjection
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.beam import Beam
 from caustic_cli.optics.emission import rays_of
@@ -25,20 +27,31 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose, tracers
 from caustic_cli.optics.waves.image import wave_image
-from caustic_cli.scene import Disc, Lens, PlaneWave, Scene, Screen
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.screen import tilt_to, tilted
+from caustic_cli.studies.gradmap import finite_difference, gradient_image
 from caustic_cli.studies.independent_rays import sample_rays
 from caustic_cli.studies.metrics import relative_rms
 
 FILTER = Filter("cosine", (3, 3))
+STEP = 1e-6
 TILTS = [(20.0, 0.0), (30.0, -25.0), (0.0, -60.0)]
 
 
 def scene(tilt, throw: float = 60.0, wide: float = 36.0, pixels: int = 30, **lens) -> Scene:
-    """A screen square to the light, `throw` mm along it from the lens' origin."""
-    lens = Lens(**{"size": (10.0, 12.0), "z_in": -1.0, "control": (9, 8), "degree": (3, 4), "index": 1.5} | lens)
-    x, y, z = (throw * c for c in tilted(tilt)[2])
-    return Scene(PlaneWave(tilt=tilt), lens, Screen((wide, wide), z, (pixels, pixels + 4), tilt=tilt, shift=(x, y)))
+    """A screen square to the light, `throw` mm along it from the lens' origin, or along the light that a flat mirror reflects."""
+    usual = {"size": (10.0, 12.0), "z_in": -1.0, "control": (9, 8), "degree": (3, 4), "index": 1.5, "offset": Offset(4.0)}
+    lens = Lens(**usual | lens)
+    side, (x, y, z) = lens.interaction.side, (throw * c for c in tilted(tilt)[2])
+    lean = tuple(side * angle for angle in tilt)
+    return Scene(PlaneWave(tilt=tilt), lens, Screen((wide, wide), side * z, (pixels, pixels + 4), tilt=lean, shift=(x, y)))
+
+
+def unit(at: tuple[int, int]) -> torch.Tensor:
+    """A change of one control height, and its opposite, (2, 9, 8)."""
+    change = torch.zeros((2, 9, 8), dtype=torch.float64)
+    change[:, *at] = torch.tensor([1.0, -1.0], dtype=torch.float64)
+    return change
 
 
 def heights(rough: float = 0.03, seed: int = 0) -> torch.Tensor:
@@ -46,27 +59,38 @@ def heights(rough: float = 0.03, seed: int = 0) -> torch.Tensor:
 
 
 def reference(scene: Scene, beam: Beam, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Image and power behind the lens in plain torch, differentiable."""
-    field, n = HeightField.of(scene.lens), scene.lens.index
+    """Image and power behind the lens, or before the mirror, in plain torch, differentiable."""
+    field, n, fresnel = HeightField.of(scene.lens), scene.lens.inside, scene.lens.interior.fresnel
     sag, *slopes = (c.reshape(beam.sample.shape) for c in field.prepare(beam.sample, torch.float64)(z))
-    direction, power = beam.rays(sag - scene.lens.z_in, slopes, n, scene.lens.fresnel)
-    out = interact(direction, slopes, power, eta=n, reflects=False, fresnel=scene.lens.fresnel)
+    direction, power = beam.rays(sag - scene.pupil.z, slopes, n, fresnel)
+    out = interact(direction, slopes, power, eta=n, reflects=scene.lens.mirror, fresnel=fresnel)
     to = Receiver.on_axis(scene.screen, (0.0, 0.0, 1.0))
     at = [c.expand(sag.shape) - m for c, m in zip((*beam.points(), sag), to.middle, strict=True)]
     on = lambda vector, e: sum(v * c for v, c in zip(vector, e, strict=True))  # noqa: E731
     t = -on(at, to.axes[2]) / on(out.direction, to.axes[2])
-    shift = scene.screen.shift
-    x, y = (on(at, e) + t * on(out.direction, e) + s for e, s in zip(to.axes, shift, strict=False))
+    x, y = (on(at, e) + t * on(out.direction, e) + s for e, s in zip(to.axes, to.at, strict=False))
     return splat(x.reshape(-1), y.reshape(-1), out.power.reshape(-1), scene.screen, FILTER)[0], out.power.sum()
 
 
 @pytest.mark.parametrize("kind", ["lines", "stratified"])
 @pytest.mark.parametrize(
-    ("tilt", "fresnel", "rough"), [(TILTS[0], "exact", 0.03), (TILTS[1], "schlick", 0.03), (TILTS[2], "exact", 0.6)]
+    ("tilt", "fresnel", "rough", "mirror"),
+    [
+        (TILTS[0], "exact", 0.03, False),
+        (TILTS[1], "schlick", 0.03, False),
+        (TILTS[2], "exact", 0.6, False),
+        ((0.0, 45.0), "exact", 0.03, True),
+        (TILTS[1], "schlick", 0.3, True),
+        ((-75.0, 0.0), "none", 0.03, True),
+    ],
 )
-def test_value_and_gradient_of_the_kernel(tilt, fresnel, rough, kind):
-    """Against the reference; with rough 0.6 some rays are totally reflected."""
-    lit, z = scene(tilt, fresnel=fresnel), heights(rough).requires_grad_()
+@pytest.mark.parametrize("faces", [True, False])
+def test_value_and_gradient_of_the_kernel(tilt, fresnel, rough, mirror, kind, faces):
+    """Against the reference; with rough 0.6 some rays are totally reflected.  The normal of the screen is along the light or, where
+    it does not face it, within 90 degrees of it."""
+    lit, z = scene(tilt, fresnel=fresnel, mirror=mirror), heights(rough).requires_grad_()
+    if not faces:
+        lit = replace(lit, screen=replace(lit.screen, tilt=(0.0, 0.0)))
     (beam,) = rays_of(lit, kind, 1500, seed=3).pencils()
     traced = Tracer(System.of(lit, HeightField.of(lit.lens)), beam)
     assert type(traced.fused).__name__ == "BeamImage"
@@ -75,17 +99,19 @@ def test_value_and_gradient_of_the_kernel(tilt, fresnel, rough, kind):
     for image, leaving in ((part.image, part.leaving), reference(lit, beam, z)):
         results += [image.detach(), leaving.detach(), torch.autograd.grad((image * pull).sum() + 0.3 * leaving, z)[0]]
     image, leaving, gradient, image_, leaving_, gradient_ = results
-    assert (float(part.lost["total_internal_reflection"]) > 0) == (rough > 0.1)
+    assert (float(part.lost["total_internal_reflection"]) > 0) == (rough > 0.1 and not mirror)
     torch.testing.assert_close(image, image_, rtol=0, atol=1e-10 * float(image_.max()))
     assert float(leaving) == pytest.approx(float(leaving_), rel=1e-10)
     assert float((gradient - gradient_).norm()) <= 1e-9 * float(gradient_.norm())
 
 
+@pytest.mark.parametrize("mirror", [False, True])
 @pytest.mark.parametrize("round", [False, True])
 @pytest.mark.parametrize("tilt", TILTS)
-def test_energy_and_image_are_those_of_rays_from_the_entrance(tilt, round):
-    """Rays through the entrance, intersected one by one, are the independent measure; some leave through the sides."""
-    lit = scene(tilt, **({"size": (10.0, 10.0), "aperture": "circle"} if round else {}))
+def test_energy_and_image_are_those_of_rays_from_the_entrance(tilt, round, mirror):
+    """Rays through the entrance, intersected one by one, are the independent measure; some leave through the sides of a lens, and
+    few miss a mirror, whose aperture lies on its surface."""
+    lit = scene(tilt, mirror=mirror, **({"size": (10.0, 10.0), "aperture": "circle"} if round else {}))
     field, z = HeightField.of(lit.lens), heights()
     ours = expose(lit, field, z, rays_of(lit, "grid", 400_000), FILTER)
     assert float(ours.image.sum()) + sum(ours.lost.values()) == pytest.approx(1.0, abs=1e-12)
@@ -93,10 +119,25 @@ def test_energy_and_image_are_those_of_rays_from_the_entrance(tilt, round):
     for state in rays_of(lit, "sobol", 1 << 18).chunks():
         part = Tracer(system, state).collect(Tracer(system, state)({EXIT: z}), lit.screen, FILTER)
         image, lost = image + part.image, {name: lost.get(name, 0.0) + float(v) for name, v in part.lost.items()}
-    assert lost["missed_surface"] > 0.05
+    assert lost["missed_surface"] < 0.01 if mirror else lost["missed_surface"] > 0.05
     for name, value in lost.items():
         assert ours.lost[name] == pytest.approx(value, abs=1e-3)
     assert float((ours.image - image).norm()) < 6e-3 * float(image.norm())
+
+
+def test_gradient_on_a_mirror_is_that_of_differences():
+    """By the kernel and by `gradmap`, of one height away from the edge, which light crosses at its own height."""
+    lit, z = scene((20.0, 45.0), mirror=True), heights().requires_grad_()
+    field, rays, at = HeightField.of(lit.lens), rays_of(lit, "lines", 40_000), (4, 3)
+    pull = torch.randn(lit.screen.resolution, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    (beam,) = rays.pencils()
+    image = Tracer(System.of(lit, field), beam).expose({EXIT: z}, lit.screen, FILTER).image
+    (slope,), z = torch.autograd.grad((image * pull).sum(), z), z.detach()
+    expected = finite_difference(lit, field, z, at, sampler=rays, filter=FILTER)
+    own = gradient_image(lit, field, z, at, sampler=rays, filter=FILTER)
+    assert float((own - expected).norm()) < 1e-6 * float(expected.norm())
+    by_kernel = [expose(lit, field, z + h, rays, FILTER).image for h in STEP * unit(at)]
+    assert float(slope[at]) == pytest.approx(float(((by_kernel[0] - by_kernel[1]) * pull).sum()) / (2.0 * STEP), rel=1e-5)
 
 
 def test_a_tilted_wave_is_a_wave_with_a_tilted_direction():
@@ -113,14 +154,16 @@ def test_a_tilted_wave_is_a_wave_with_a_tilted_direction():
     assert float((other - image).norm()) < 0.02 * float(image.norm())
 
 
-@pytest.mark.parametrize("tilt", [(0.0, 40.0), (-50.0, 20.0)])
-def test_wave_image(tilt):
+@pytest.mark.parametrize(("tilt", "mirror"), [((0.0, 40.0), False), ((-50.0, 20.0), False), ((0.0, 45.0), True)])
+def test_wave_image(tilt, mirror):
     """Blurred to the width of diffraction, it is the ray image; it is worse by rays along the axis."""
-    lit = scene(tilt, 300.0, 20.0, 96, size=(10.0, 10.0), z_in=0.0, control=(24, 24), degree=(3, 3))
+    more = {"mirror": mirror, "offset": Offset(5.0)}
+    lit = scene(tilt, 300.0, 20.0, 96, size=(10.0, 10.0), z_in=0.0, control=(24, 24), degree=(3, 3), **more)
     field = HeightField.of(lit.lens)
     x, y = (c.numpy() for c in field.control_xy())
     x, y = np.meshgrid(x, y, indexing="ij")
-    z = torch.from_numpy(5.0 - 0.001 * (x**2 + y**2) + 0.004 * np.sin(0.9 * x + 0.5) * np.cos(0.7 * y))
+    relief = -0.001 * (x**2 + y**2) + 0.004 * np.sin(0.9 * x + 0.5) * np.cos(0.7 * y)
+    z = torch.from_numpy(5.0 + relief * (-0.35 if mirror else 1.0))
     light = wave_image(lit, field, z, wavelengths=(540.0, 550.0, 560.0)).image.numpy()
     rays = expose(lit, field, z, rays_of(lit, "grid", 400_000)).image.numpy()
     assert light.sum() == pytest.approx(rays.sum(), rel=3e-3)
@@ -128,17 +171,50 @@ def test_wave_image(tilt):
     assert np.linalg.norm(blurred[0] - blurred[1]) < 0.02 * np.linalg.norm(blurred[1])
 
 
-@pytest.mark.parametrize(("tilt", "most"), [((0.0, 0.0), 0.12), ((20.0, 0.0), 0.14), ((0.0, -40.0), 0.16)])
-def test_start_by_transport(tilt, most):
-    """A smooth picture on a screen square to the light is nearly reached by the first surface; a screen across the axis is not."""
-    lit = scene(tilt, 300.0, 36.0, 60, size=(10.0, 10.0), z_in=0.0, control=(103, 103), degree=(3, 3))
-    lit = replace(lit, screen=replace(lit.screen, resolution=(60, 60)), lens=replace(lit.lens, offset=Lens().offset))
+@pytest.mark.parametrize(
+    ("tilt", "most", "mirror"),
+    [
+        ((0.0, 0.0), 0.12, False),
+        ((20.0, 0.0), 0.14, False),
+        ((0.0, -40.0), 0.16, False),
+        ((0.0, 0.0), 0.05, True),
+        ((45.0, 0.0), 0.06, True),
+        ((30.0, -50.0), 0.1, True),
+        ((0.0, 75.0), 0.08, True),
+    ],
+)
+@pytest.mark.parametrize("aperture", ["rectangle", "circle"])
+def test_start_by_transport(tilt, most, mirror, aperture):
+    """A smooth picture on a screen square to the light is nearly reached by the first surface; a screen across the axis is not.
+    From a round aperture, at most at twice the error, as in light along the axis."""
+    more = {"mirror": mirror, "offset": Offset(5.0), "aperture": aperture}
+    lit = scene(tilt, 300.0, 36.0, 60, size=(10.0, 10.0), z_in=0.0, control=(103, 103), degree=(3, 3), **more)
+    lit = replace(lit, screen=replace(lit.screen, resolution=(60, 60)))
     x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 60)] * 2, indexing="ij")
     target = np.exp(-3.0 * ((x - 0.1) ** 2 + (y + 0.2) ** 2)) * (np.maximum(abs(x), abs(y)) < 0.8)
     field = HeightField.of(lit.lens)
     z = first_surface(lit, target, field, 200).heights
     image = expose(lit, field, z, rays_of(lit, "stratified", 400_000)).image.numpy()
-    assert relative_rms(image, target * image.sum() / target.sum()) < most
+    assert relative_rms(image, target * image.sum() / target.sum()) < most * (2.0 if aperture == "circle" else 1.0)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_the_slope_of_a_plane_surface_sends_the_light_to_the_middle_of_the_screen(mirror):
+    """By a twentieth of the way there, to first order."""
+    lit = scene((20.0, -40.0), 300.0, 60.0, 30, size=(1.0, 1.0), mirror=mirror, offset=Offset(0.0), z_in=0.0)
+    (x, y), lens = lit.screen.shift, lit.lens
+    lit = replace(lit, screen=replace(lit.screen, shift=(x + 14.0, y - 9.0)))
+    leans = BeamProjection(lit.screen, 0.0, lens.interaction.side, lit.source.axis).lean(lens.effective_index)
+    field = HeightField.of(lens)
+    at = zip(leans, field.control_xy(), ((-1, 1), (1, -1)), strict=True)
+    z = sum(slope * c.reshape(shape) for slope, c, shape in at) + torch.zeros(field.shape, dtype=torch.float64)
+    image = expose(lit, field, z + (0.0 if mirror else 0.1), rays_of(lit, "grid", 10_000), FILTER).image.numpy()
+    i, j = np.indices(image.shape)
+    middle = [
+        float((k * image).sum() / image.sum() - 0.5 * (n - 1)) * w
+        for k, n, w in zip((i, j), image.shape, lit.screen.pixel, strict=True)
+    ]
+    assert math.hypot(*middle) < 0.06 * math.hypot(14.0, 9.0)
 
 
 def turned(screen: Screen) -> tuple[Screen, Screen]:
@@ -235,14 +311,17 @@ def design(*options: str) -> int:
     return cli.run(["design", "blob.png", "--waves", "off", "--quality", "draft", "--resolution", "24", "-o", "p", *options])
 
 
-def test_design_and_render(in_tmp, capfd):
+@pytest.mark.parametrize("mirror", [False, True])
+def test_design_and_render(in_tmp, capfd, mirror):
     """The screen stands square to the light and on it; power and error are those of a render by other rays."""
     write_blob()
-    assert design("--source-tilt", "30,0", "--json") == 0
+    assert design("--source-tilt", "30,0", "--json", *(["--mirror"] if mirror else [])) == 0
     made = json.loads(capfd.readouterr().out)
     project = (in_tmp / "p" / "project.toml").read_text()
-    assert "tilt = [30.0, 0.0]" in project and f"shift = [0.0, {-300.0 * math.tan(math.radians(30.0))!r}"[:24] in project
-    assert made["error"] < 0.2 and made["lost"]["missed_surface"] > 0.05
+    assert f"tilt = [{-30.0 if mirror else 30.0}, 0.0]" in project
+    assert f"shift = [0.0, {-300.0 * math.tan(math.radians(30.0))!r}"[:24] in project
+    assert made["error"] < 0.2 and (made["lost"]["missed_surface"] > 0.05) != mirror
+    assert made["on_screen"] > (0.99 if mirror else 0.5)
     assert cli.run(["render", "p", "--json", "--rays", "100000", "-o", "image.png"]) == 0
     seen = json.loads(capfd.readouterr().out)
     assert seen["relative_rms"] == pytest.approx(made["relative_rms"], abs=0.05)
@@ -253,8 +332,6 @@ def test_design_and_render(in_tmp, capfd):
     [
         (("--source-tilt", "85,0"), "-80 to 80"),
         (("--source-tilt", "70,60"), "within 80 degrees"),
-        (("--source-tilt", "20,0", "--mirror"), "one lens with a flat entrance"),
-        (("--source-tilt", "20,0", "--array", "2"), "one lens with a flat entrance"),
         (("--source-tilt", "20,0", "--robust", "t.toml"), "--robust"),
         (("--source-tilt", "20,0", "--source", "point"), "tilt"),
         (("--source-tilt", "20,0", "--source", "disc"), "disc with an angle"),
@@ -281,11 +358,16 @@ def test_what_has_no_tilted_light_says_so(in_tmp, capfd):
     assert cli.run(["export", "p", "--format", "stl", "-o", "p.stl"]) == 0
 
 
-def test_an_archive_holds_the_direction(tmp_path):
-    lit = scene(TILTS[1])
-    write_lighttools(tmp_path / "a.npz", lit, HeightField.of(lit.lens), heights())
-    source = open_archive(tmp_path / "a.npz")[0].source
-    assert source.tilt == TILTS[1] and source.axis == lit.source.axis
+@pytest.mark.parametrize("mirror", [False, True])
+def test_an_archive_holds_the_direction(tmp_path, mirror):
+    """And light meets the mirror in the plane of its edge, which is that of its base surface here."""
+    lit = scene(TILTS[1], mirror=mirror, offset=Offset(4.0, (80.0, 80.0)), degree=(3, 3))
+    x, y = (c.numpy() for c in HeightField.of(lit.lens).control_xy())
+    field, z = HeightField.of(lit.lens), torch.from_numpy(lit.lens.offset.heights(x, y))
+    write_lighttools(tmp_path / "a.npz", lit, field, field.interpolated(z))
+    read = open_archive(tmp_path / "a.npz")[0]
+    assert read.source.tilt == TILTS[1] and read.source.axis == lit.source.axis
+    assert read.pupil.z == pytest.approx(lit.pupil.z, abs=1e-4 if mirror else 1e-12)
 
 
 def test_grazing_light_is_refused():

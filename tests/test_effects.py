@@ -31,10 +31,10 @@ DETOURS, STAGES = Requests.to("ghosts", "secondary-intersection"), Requests(stag
 
 def scene_of(source=None, *, degree=(2, 2), control=(9, 8), screen=None, light=None, **lens) -> Scene:
     """A 10 x 8 mm lens about 3 mm thick, 60 mm before a screen of 16 x 14 mm."""
-    options = {"index": N, **lens}
+    options = {"index": N, "offset": Offset(3.0), **lens}
     return Scene(
         source or PlaneWave(),
-        Lens((10.0, 8.0), 0.0, control=control, degree=degree, offset=Offset(3.0), **options),
+        Lens((10.0, 8.0), 0.0, control=control, degree=degree, **options),
         screen or Screen((16.0, 14.0), 60.0, (32, 28)),
         light or Light(),
     )
@@ -210,6 +210,20 @@ def test_an_elliptic_mirror_is_met_from_a_point():
     assert int(on.sum()) > 200
     dx, _, dz = rays.direction
     torch.testing.assert_close(landing.origin[0][on], 86.0 * (dx / dz)[on], rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("source", "most"), [(Points(((0.0, 0.0, -20.0),)), 0.01), (PlaneWave(tilt=(0.0, 60.0)), 0.01), (PlaneWave(), 0.0)]
+)
+@pytest.mark.parametrize("radius", [-40.0, math.inf, 60.0])
+def test_light_fills_a_mirror(source, most, radius):
+    """Its aperture lies at the mean height of the edge: hardly any light passes a curved one, none of a rectangle a flat one."""
+    scene = scene_of(source, screen=Screen((500.0, 500.0), -40.0, (8, 8)), mirror=True, offset=Offset(3.0, (radius, radius)))
+    field, base = HeightField.of(scene.lens), scene.lens.offset
+    z = heights_through(scene, lambda x, y: torch.from_numpy(base.heights(x[:, 0].numpy(), y[0].numpy())))
+    found = expose(scene, field, z, rays_of(scene, "stratified", 40_000), Filter("bincount"))
+    assert abs(found.lost["missed_surface"]) <= most * (1.0 if math.isfinite(radius) else 1e-9)
+    assert float(found.image.sum()) + sum(found.lost.values()) == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("tilt", [(25.0, 0.0), (0.0, -35.0), (20.0, 40.0)])

@@ -1,6 +1,7 @@
 """Effects on the command line and in project.toml: --explain, --effects, --study effects, mirrors, colours."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -243,6 +244,14 @@ def test_a_lens_of_many_indices_makes_no_mirror():
     """The study leaves out what the scene cannot have."""
     lens = Lens(control=(6, 6), gradient=Gradient("selfoc", (0.1,)))
     assert Mirror().probe(Scene(PlaneWave(), lens, Screen((20.0, 20.0))), torch.ones(6, 6)) is None
+
+
+def test_a_lens_in_tilted_light_makes_a_mirror_whose_screen_faces_it():
+    """The light of a flat one arrives at the middle of its screen, which stands square to it."""
+    screen = Screen((20.0, 20.0), 100.0, tilt=(0.0, 45.0, 10.0), shift=(95.0, 0.0))
+    made = Mirror().probe(Scene(PlaneWave(tilt=(0.0, 45.0)), Lens(control=(6, 6)), screen), torch.full((6, 6), 5.0))
+    (x, _, z), normal = made.scene.screen.centre, made.scene.screen.axes[2]
+    assert (x, z) == (95.0, -90.0) and normal == pytest.approx((-math.sqrt(0.5), 0.0, math.sqrt(0.5)))
 
 
 def test_rounds_of_a_wave_image(monkeypatch):

@@ -14,7 +14,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.obstruction import RAYS, LightPath, clear_shift, refuse_obstructed
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Component, Disc, FoldMirror, Lens, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.scene.screen import Sags
+from caustic_cli.scene.screen import Sags, tilted
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
@@ -149,6 +149,53 @@ def test_a_screen_behind_a_lens_is_in_no_light(source, tilt):
 
 
 @pytest.mark.parametrize(
+    ("screen", "lens", "words"),
+    [
+        (Screen((100.0, 100.0), 100.0, tilt=(60.0, 0.0), shift=(0.0, 40.0)), LENS, None),
+        (Screen((100.0, 100.0), 100.0, tilt=(60.0, 0.0), shift=(0.0, -100.0)), LENS, None),
+        (
+            Screen((100.0, 100.0), 100.0, tilt=(80.0, 0.0), shift=(0.0, 100.0)),
+            LENS,
+            "behind the lens and face it: it turns its back to it",
+        ),
+        (
+            Screen((100.0, 100.0), 100.0, tilt=(80.0, 0.0), shift=(0.0, 17.0)),
+            LENS,
+            "behind the lens and face it: its plane passes through it",
+        ),
+        (Screen((384.0, 384.0), -1000.0, tilt=(85.0, 0.0), shift=(0.0, 250.0)), MIRROR, None),
+        (
+            Screen((384.0, 384.0), -1000.0, tilt=(85.0, 0.0), shift=(0.0, -250.0)),
+            MIRROR,
+            "before the mirror and face it: it turns its back",
+        ),
+    ],
+)
+def test_the_back_of_a_screen(screen, lens, words):
+    """Its plane meets the axis z - shift tan(tilt) from the origin."""
+    scene = Scene(PlaneWave(), lens, screen)
+    if words is None:
+        refuse_obstructed(scene)
+    else:
+        with pytest.raises(InputError, match=words):
+            refuse_obstructed(scene)
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 40.0), (-60.0, 0.0), (20.0, 70.0)])
+def test_a_screen_square_to_reflected_light_is_beside_it(tilt):
+    """And one before the mirror, in the incident light, is refused with the part of the beam that it covers."""
+    dx, dy, dz = tilted(tilt)[2]
+    sun, reach = PlaneWave(tilt=tilt), 1000.0
+    free = Screen((384.0, 384.0), 2.0 - reach * dz, tilt=(-tilt[0], -tilt[1]), shift=(reach * dx, reach * dy))
+    refuse_obstructed(Scene(sun, MIRROR, free))
+    before = Screen((10.0, 384.0), 2.0 - reach * dz, tilt=tilt, shift=(-reach * dx, -reach * dy))
+    one = found(sun, before)
+    assert (one.body, one.behind) == ("the screen", "the mirror")
+    ex = tilted(tilt)[0]  # of a square, its shadow on the mirror along the light is a strip along y
+    assert one.fraction == pytest.approx(0.1 / ex[0] if tilt[0] == 0.0 or tilt[1] == 0.0 else one.fraction, abs=0.01)
+
+
+@pytest.mark.parametrize(
     ("source", "shift"),
     [
         (PlaneWave(), (0.0, 250.0)),
@@ -168,6 +215,7 @@ def test_the_least_shift_out_of_the_light(source, shift):
 
 # designs and renders
 
+SUNLIT = ["--mirror", "--lens-size", "100", "--throw", "1000", "--mag", "3", "--margin", "0.28", "--source-angle", "0.533"]
 SMALL = ["--resolution", "24", "--control", "12", "--rays", "4000", "--iterations", "1", "--waves", "off"]
 
 
@@ -184,7 +232,7 @@ def run(capfd, *arguments, code=0):
 
 @pytest.mark.usefixtures("here")
 def test_a_mirror_throws_its_picture_beside_the_light_on_it(capfd):
-    out, err = run(capfd, "design", "blob.png", "--preset", "mirror-100", *SMALL, "--json")
+    out, err = run(capfd, "design", "blob.png", *SUNLIT, *SMALL, "--json")
     assert "the screen is shifted by 0,250 mm" in err and json.loads(out)["on_screen"] > 0.9
     project = Project.open("blob.caustic")
     assert project.settings.screen.shift == (0.0, 250.0) and found(SUN, project.scene().screen) is None
@@ -197,10 +245,21 @@ def test_a_mirror_throws_its_picture_beside_the_light_on_it(capfd):
         assert err.startswith("caustic: the screen stands in the light that falls on the mirror and shadows ")
         assert err.count("\n") == 1 and "; accepted: a lens designed for a screen beside it, such as --screen-shift 0,2" in err
         assert {p: p.read_bytes() for p in Path().rglob("*") if p.is_file()} == before
-    _, err = run(capfd, "design", "blob.png", "--preset", "mirror-100", "--mag", "4", *SMALL, "-o", "wide.caustic")
+    _, err = run(capfd, "design", "blob.png", *SUNLIT, "--mag", "4", *SMALL, "-o", "wide.caustic")
     assert "the screen is shifted by 0,310 mm" in err
     _, err = run(capfd, "design", "blob.png", "--mirror", "--screen-shift", "0,20", *SMALL, "-o", "in.caustic", code=2)
     assert "shadows 42" in err and "such as --screen-shift 0,25" in err and not Path("in.caustic").exists()
+
+
+@pytest.mark.usefixtures("here")
+def test_the_mirror_of_the_preset_is_lit_from_the_side(capfd):
+    """Its wall is 1 m away along the light, square to it, and beside the light on the mirror."""
+    out, err = run(capfd, "design", "blob.png", "--preset", "mirror-100", *SMALL, "--json")
+    made, screen = json.loads(out), Project.open("blob.caustic").scene().screen
+    assert "shifted" not in err and made["on_screen"] > 0.9 and made["lost"]["missed_surface"] < 0.02
+    assert math.dist(screen.centre, (0.0, 0.0, 0.0)) == pytest.approx(1000.0, abs=0.1)
+    assert screen.axes[2] == pytest.approx([-c / 1000.0 for c in screen.centre], abs=1e-4)
+    run(capfd, "render", "blob.caustic", "--rays", "1e4")
 
 
 @pytest.mark.usefixtures("here")

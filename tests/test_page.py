@@ -193,7 +193,7 @@ def test_rays_of_a_file_are_refused(home, monkeypatch, capfd):
     assert "not the rays of a file" in capfd.readouterr().err and not Path("rays.html").exists() and not Path("rays.png").exists()
     scene = load(home / "point.caustic").scene
     assert PAGE.supports(scene)
-    rays = replace(scene, source=SimpleNamespace(rays=1, members=(1,), nearest=-60.0))
+    rays = replace(scene, source=SimpleNamespace(rays=1, members=(1,), nearest=-60.0, distant=False))
     assert "plane waves, points, grids and discs" in PAGE.why_not(rays)
 
 

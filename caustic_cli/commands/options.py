@@ -409,8 +409,8 @@ HELP = {
     "design.over": "Train a network whose inputs vary over ranges (mm), so that it gives a lens for every value, selected with --at"
     " in the other commands: throw=250:350; also source.x, source.y, source.z.",
     "target.flip": "Mirror the picture along x, y or xy, for a viewer on the lens' side.",
-    "lens.mirror": "The surface is a mirror; the screen is on the source's side, at the distance --throw, and shifted out"
-    " of the source's light unless --screen-shift says where.",
+    "lens.mirror": "The surface is a mirror; the screen is on the source's side, at the distance --throw, square to light of"
+    " --source-tilt, or else shifted out of the source's light, unless --screen-shift says where.",
     "source.wavelengths": "Spectrum of the source: wavelengths (nm) and relative powers; a --glass has its own index at each.",
 }
 #: Settings that are options of every command.

@@ -117,7 +117,7 @@ def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping
         if not source.oblique:
             return s.screen
         x, y, z = (abs(s.screen.z) / source.axis[2] * c for c in source.axis)
-        return s.screen.filled(tilt=[interaction.side * angle for angle in source.tilt], shift=[x, y])
+        return s.screen.filled(tilt=[interaction.side * angle + 0.0 for angle in source.tilt], shift=[x + 0.0, y + 0.0])
     twice = ["⟨throw⟩"] * (by.throw is not None) + [f"⟨screen.{key}⟩" for key in ("z", "tilt", "shift") if key in given]
     if twice or s.elements:
         why = f"{twice[0]} would be another" if twice else "⟨element⟩ has the screen on its own axis"

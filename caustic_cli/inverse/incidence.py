@@ -148,7 +148,7 @@ def _tilted(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     """`incident` of light from infinity along the source's axis: that of its profile where it crossed the entrance."""
     lens, profile = scene.lens, scene.source.profile
     kx, ky = slopes_inside(scene.source.axis, lens.inside)
-    depth = z - lens.z_in
+    depth = z - lens.pupil.z
     crossed = [cell_means(c + 0.0 * depth) for c in (x[:, None] - kx * depth, y[None, :] - ky * depth)]
     zx, zy = np.gradient(z, x, y)
     light = cell_means(1.0 - kx * zx - ky * zy)  # D . N, see `optics.beam`
@@ -182,8 +182,9 @@ def lit_rectangle(
         for _ in range(PASSES if slope else 0):  # the light that passes this edge of the entrance meets the exit at its own height
             places = list(lines)
             places[axis] = np.array([limit[axis]])
-            depth = float(surface(*places).min()) - lens.z_in
-            limit[axis] = math.copysign(lens.half_size[axis], -slope) + slope * depth
+            depth = float(surface(*places).min()) - lens.pupil.z
+            half = lens.half_size[axis]
+            limit[axis] = min(half, max(-half, math.copysign(half, -slope) + slope * depth))
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise InputError("⟨source.tilt⟩: all light leaves the lens through its sides; a thinner lens or less tilt keeps some")
     return (low[0], low[1]), (high[0], high[1])
@@ -224,7 +225,7 @@ def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
         profile = source.profile
         return (np.ones(shape) if profile is None else resampled(profile, shape)), None
     x0, y0, z0 = source.centre
-    h, t, n = lens.z_in - z0, z - lens.z_in, lens.inside
+    h, t, n = lens.pupil.z - z0, z - lens.pupil.z, lens.inside
     if h <= 0:
         raise InputError(
             f"⟨source.file⟩: its rays meet at z = {z0:.4g} mm, not before the lens, as an initial surface by transport"
@@ -232,7 +233,9 @@ def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
         )
     dx, dy = x[:, None] - x0, y[None, :] - y0
     rho = np.hypot(dx, dy)
-    q = np.maximum(rho / (h + t / n), (rho - t / math.sqrt((n - 1.0) * (n + 1.0))) / h)
+    q = rho / (h + t / n)
+    if n > 1.0:
+        q = np.maximum(q, (rho - t / math.sqrt((n - 1.0) * (n + 1.0))) / h)
     for _ in range(STEPS):
         root = np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * q)
         step = (rho - h * q - t * q / root) / (h + t * n * n / root**3)

@@ -27,9 +27,10 @@ from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import cell_lines, cell_means, corners
+from caustic_cli.optics.interface import slopes_inside
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Component, Lens, Scene
+from caustic_cli.scene import Aperture, Component, Lens, Scene
 from caustic_cli.scene.elements import SIDES
 
 #: Most cells for which transport is solved.  Where more are needed, as for creases, it is solved on about COARSE, and the map is
@@ -100,7 +101,8 @@ class _Grid:
         (mx, my), whole = self.middle, self.whole
         if not (mx or my):
             return whole
-        lens = replace(whole.lens, size=(2.0 * float(self.x[-1]), 2.0 * float(self.y[-1])))
+        size = 2.0 * float(self.x[-1]), 2.0 * float(self.y[-1])
+        lens = replace(whole.lens, size=size, aperture=Aperture.name)  # what is dark of it is so in `incident`
         (sx, sy) = whole.screen.shift
         return replace(whole, lens=lens, screen=replace(whole.screen, shift=(sx - mx, sy - my)))
 
@@ -121,7 +123,7 @@ class _Grid:
     @property
     def floor(self) -> float:
         """Least height of the exit by the least thickness, mm."""
-        return self.scene.lens.z_in + self.scene.lens.min_thickness
+        return self.scene.lens.floor
 
     def scaled(self, values: np.ndarray, onto: _Grid) -> np.ndarray:
         """Values at the corners, interpolated at those of another grid."""
@@ -274,8 +276,12 @@ def first_surface(
     grid, lens = _Grid.of(scene, target, cells // times), scene.lens
     z = grid.offset
     if scene.source.oblique:  # the shadow of the lens' sides depends on the heights
-        rough = _Grid.of(scene, target, ROUGH)
-        surface = extended(*rough.places, rough.solved(*rough.incident(rough.offset), float(rough.offset.mean())).heights)
+        begun = _in_aperture(lens) if lens.mirror else lens.offset.heights
+        rough = _Grid.of(scene, target, ROUGH, begun)
+        solved = rough.solved(*rough.incident(begun(*rough.places)), float(rough.offset.mean())).heights
+        if lens.mirror:  # with its edge in the aperture of the light, none of which then passes it
+            solved = solved + lens.pupil.z - _edge(solved, slopes_inside(scene.source.axis, 1.0))
+        surface = extended(*rough.places, solved)
         grid = _Grid.of(scene, target, cells // times, surface)
         z = surface(*grid.places)
     if scene.source.distant or lens.mirror or scene.elements:
@@ -382,6 +388,17 @@ def departure_bound(element: Component, lens: Lens) -> float:
     thickness."""
     thinnest = element.thinnest
     return min(lens.height_range[1], THICKNESS_PART * thinnest)
+
+
+def _in_aperture(lens: Lens) -> Surface:
+    """The plane of the aperture that the source illuminates."""
+    return lambda x, y: np.full((len(x), len(y)), lens.pupil.z)
+
+
+def _edge(z: np.ndarray, slopes: tuple[float, float]) -> float:
+    """Mean height along the edge, of the sides along y and those along x by the slope of light across them."""
+    (across, along), sides = (abs(s) for s in slopes), (z[[0, -1]].mean(), z[:, [0, -1]].mean())
+    return float((across * sides[0] + along * sides[1]) / (across + along))
 
 
 def _middle(z: np.ndarray) -> float:

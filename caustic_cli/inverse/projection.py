@@ -11,7 +11,7 @@ close to optimal transport onto (u, v), not onto (x, y): the picture, power on t
 The depth of the screen beyond the first order is taken into account by `surface_from_map`, which aims at P itself.
 
 Light from infinity along d, a unit vector at an angle to the axis, leaves the surface with the transverse direction cosines
-t = d + (n c' - c) grad z to first order, where c = d_z, n c' = sqrt(n^2 - 1 + c^2) of a lens and -c of a mirror.  These are
+t = d + (n c' - c) grad z to first order, where c = d_z, n c' = sqrt(n^2 - 1 + c^2), or d + 2 c grad z from a mirror.  These are
 isotropic in the slope, as tangents are not: there (u, v) = R (t_x, t_y), with R the distance of the screen's centre from c, and the
 point (x, y) of the lens adds (x, y) - t (t . (x, y)).
 """
@@ -140,7 +140,11 @@ class BeamProjection(ScreenProjection):
     def gain(self, index: float) -> float:
         """As of a `ScreenProjection`."""
         c = self.beam[2]
-        return self.distance * (-2.0 * c if index < 0 else math.sqrt((index - 1.0) * (index + 1.0) + c * c) - c)
+        return self.distance * (2.0 * c if index < 0 else math.sqrt((index - 1.0) * (index + 1.0) + c * c) - c)
+
+    def lean(self, index: float) -> list[float]:
+        """Slopes along x and y of a plane surface that sends the light to the centre of the screen, to first order."""
+        return [(c - self.distance * d) / self.gain(index) for c, d in zip(self._linear[0], self.beam[:2], strict=True)]
 
     @cached_property
     def _linear(self) -> tuple[np.ndarray, np.ndarray]:

@@ -172,8 +172,8 @@ def etendue_limit(scene: Scene) -> float | None:
     elif min(source.extent) > 0 and len(source.points()[0]) == 1:
         a, b, part = _area(source.extent, CircularAperture())
         x0, y0, z0 = source.points()[0][0]
-        seen = _geometric_factor(x, y, (a + x0, b + y0, z0 - lens.z_in))
-        slope = np.hypot(a + x0 - x[:, None], b + y0 - y[:, None]) / (lens.z_in - z0)
+        seen = _geometric_factor(x, y, (a + x0, b + y0, z0 - lens.pupil.z))
+        slope = np.hypot(a + x0 - x[:, None], b + y0 - y[:, None]) / (lens.pupil.z - z0)
         cone = source.cone_over(lens.pupil)
         given = cell * part * seen[(np.arctan(slope) <= cone) & (relative(source.intensity, slope) > 0)].sum()
     else:

@@ -40,6 +40,8 @@ KEYS = (
 )
 #: Most cells along an axis of a picture of a source.
 MOST_CELLS = 1 << 16
+#: Signs of x and y in the four quadrants.
+CORNERS = (-1.0, -1.0, 1.0, 1.0), (-1.0, 1.0, -1.0, 1.0)
 
 
 def open_archive(path: str | Path, rays: RaySet | None = None) -> tuple[Scene, HeightField, Tensor]:
@@ -65,8 +67,10 @@ def open_archive(path: str | Path, rays: RaySet | None = None) -> tuple[Scene, H
             absorption=data.real("absorption") if "absorption" in data else 0.0,
             roughness=data.real("roughness") if "roughness" in data else 0.0,
             glass=data.text("glass") if "glass" in data else None,
-            offset=Offset(float(field.at(heights, *torch.zeros(2, 1, dtype=torch.float64), ((0, 0),))[0])),
         )
+        place = lens.opening.on_edge if lens.mirror else (0.0, 0.0)  # where light meets it first: at the edge of a mirror
+        x, y = (c * torch.tensor(signs, dtype=torch.float64) for c, signs in zip(place, CORNERS, strict=True))
+        lens = replace(lens, offset=Offset(float(field.at(heights, x, y, ((0, 0),))[0].mean())))
         if lens.glass is not None:
             material(lens.glass)
         if "entrance_control_points" in data:

@@ -34,6 +34,7 @@ from caustic_cli.inverse.objective import LossOfHeights, Objective, SourceBlur
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import FreeHeights, Heights
 from caustic_cli.inverse.problem import Problem, Skipped
+from caustic_cli.inverse.projection import BeamProjection
 from caustic_cli.inverse.reachability import refuse_unreachable
 from caustic_cli.inverse.sharpness import advice
 from caustic_cli.inverse.source_limits import (
@@ -137,7 +138,7 @@ class OneSurface(Problem):
             InputError: a value is out of range, or two contradict each other.
         """
         width = max(lens.size)
-        lens = lens.filled(thickness=width / 2.0 if width <= PLATE else WALL + width / 10.0)
+        lens = lens.filled(thickness=0.0 if lens.mirror else width / 2.0 if width <= PLATE else WALL + width / 10.0)
         return lens.filled(height_range=(-width / 10.0, width / 10.0))
 
     @classmethod
@@ -379,12 +380,14 @@ class OneSurface(Problem):
     def offset(self) -> Tensor | None:
         """Heights (n, m) mm of the offset surface with the slope that turns its light to the centre of a shifted screen; None for
         one that is not shifted, or for a network, whose heights are relative to the offset surface."""
-        shift = self.scene.screen.shift
-        if not (any(shift) and self.options.parametrisation.free):
+        screen, lens, source = self.scene.screen, self.scene.lens, self.scene.source
+        if not (any(screen.shift) and self.options.parametrisation.free):
             return None
-        lens = self.scene.lens
         x, y = (c.numpy() for c in self.field(0).control_xy())
-        slope = [c / ((lens.effective_index - 1.0) * (self.scene.screen.z - lens.offset.thickness)) for c in shift]
+        vertex, index = lens.offset.thickness, lens.effective_index
+        slope = [c / ((index - 1.0) * (screen.z - vertex)) for c in screen.shift]
+        if source.oblique:
+            slope = BeamProjection(screen, vertex, lens.interaction.side, source.axis).lean(index)
         return torch.from_numpy(lens.offset.heights(x, y) + slope[0] * x[:, None] + slope[1] * y[None, :])
 
     def transport(self, fixed: bool, seconds: float) -> InitialSurface:
@@ -404,7 +407,7 @@ class OneSurface(Problem):
             light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
             scene, goal = replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
         surface, lens = self.solved(scene, goal, cells, fixed, seconds), self.scene.lens
-        short = lens.z_in + lens.min_thickness - float(surface.heights.min())
+        short = lens.floor - float(surface.heights.min())
         return replace(surface, heights=surface.heights + 1.01 * short) if fixed and short > 0 else surface
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:

@@ -1,4 +1,4 @@
-"""Parallel rays behind a flat entrance, through given points of the exit surface instead of the entrance.
+"""Parallel rays behind a flat entrance, through given points of the exit surface instead of the entrance; or on a mirror.
 
 As of a `pencil`, whose vertex is at infinity here: nothing is intersected.
 
@@ -14,7 +14,8 @@ the exit is
     dP = E T D . N dx dy
 
 where the ray crossed the aperture of the entrance, at (x, y) - z k; other points of the exit are dark.  The light that crosses the
-entrance and does not reach the exit is lost through the sides of the lens.
+entrance and does not reach the exit is lost through the sides of the lens.  For a mirror the entrance is its aperture in the plane
+of its edge, with n = 1.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ class Beam(Bundle):
     sample: the points and the area of the aperture, mm^2, that each stands for, scalar or of their shape; aperture: of entrance and
     exit.
     """
+
+    reflects = True
 
     sample: Sample
     aperture: Aperture

@@ -141,14 +141,14 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     source, lens = scene.source, scene.lens
     if scene.axial:
         return 1.0
-    if lowest < lens.z_in or scene.in_front:
+    if lowest < lens.interaction.base(lens.z_in) or scene.in_front:
         return math.inf
-    low = min(0.0, entrance_of(lens).hull(None)[0]) if lens.entrance is not None else 0.0
-    drift = (top - lens.z_in - low) * math.tan(min(inside, 1.57))
+    low, start = min(0.0, entrance_of(lens).hull(None)[0]) if lens.entrance is not None else 0.0, lens.pupil.z
+    drift = max(top - start - low, start - lowest) * math.tan(min(inside, 1.57))
     if source.distant:
         return 1.0 + drift / min(lens.half_size)
     positions, extent, cone = source.points()[0], source.extent, source.cone_over(lens.pupil)
-    wide = (lens.z_in - positions[:, 2]) * math.tan(cone) if cone < math.pi / 2.0 else np.full(len(positions), math.inf)
+    wide = (start - positions[:, 2]) * math.tan(cone) if cone < math.pi / 2.0 else np.full(len(positions), math.inf)
     far = lens.opening.distances(*(np.abs(positions[:, k]) + extent[k] for k in (0, 1)))
     return max(float(((np.minimum(d + wide, r) + drift) / r).max()) for d, r in far)
 

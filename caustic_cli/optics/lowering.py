@@ -1,7 +1,7 @@
 """The lowering of a trace to one fused kernel: the only place that knows which systems it covers.
 
 It takes the rays in front of the last surface, a single upright B-spline at the origin in front of an upright screen, where nothing
-but refraction with Fresnel losses happens to them; see `backends`.
+but refraction with Fresnel losses happens to them, or reflection of parallel light; see `backends`.
 """
 
 from __future__ import annotations
@@ -40,9 +40,16 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
 
 def _pencil(tracer, pencil: Bundle, previous: Fused | None) -> Fused | None:
     """All of a tracer's system as one kernel for the rays of a source point, or of one at infinity: a flat entrance in front of the
-    last surface."""
+    last surface, or a mirror alone."""
     system = tracer.system
-    if _needs_stages(tracer) or len(system.elements) != 2 or not system.lit:
+    if _needs_stages(tracer) or not system.lit:
+        return None
+    if len(system.elements) == 1 and pencil.reflects:
+        (exit,), pupil = system.elements, system.pupil
+        if not (exit.reflects and _is_upright(exit, pupil) and exit.aperture == pupil.aperture):
+            return None
+        return pencil.maker(tracer.backend)(exit.surface, pencil, (1.0, "none"), -1.0, "none", previous)
+    if len(system.elements) != 2:
         return None
     (entrance, exit), pupil = system.elements, system.pupil
     upright = isinstance(entrance.surface, Plane) and entrance.pose == Pose((0.0, 0.0, pupil.z)) and not entrance.reflects
@@ -63,10 +70,14 @@ def _needs_stages(tracer) -> bool:
 
 def _is_plain(element: Element, pupil: Pupil) -> bool:
     """Whether an element is a refracting B-spline over the pupil, upright at the origin."""
+    return not element.reflects and _is_upright(element, pupil)
+
+
+def _is_upright(element: Element, pupil: Pupil) -> bool:
+    """Whether an element is a B-spline over the pupil, upright at the origin."""
     surface = element.surface
     return (
         isinstance(surface, HeightField)
-        and not element.reflects
         and element.pose == Pose()
         and element.aperture.half_size == surface.half_size == pupil.half_size
     )

@@ -8,6 +8,9 @@ not obstruct it.
     source -> first element     rays of the source, weighted by their power, so that the fraction is that of the light on it
     element -> element, screen  paths from every point of one to every point of the other, whatever is between
 
+The paths from the last element to a plane screen have to arrive at that face of it which is lit by the light of the axis: at the
+other one, no light is counted.
+
 A trace is sequential, so it does not notice bodies that light would have to cross; here they are found before.
 """
 
@@ -26,7 +29,9 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.emission import Emission, rays_of
 from caustic_cli.optics.frames import IDENTITY, Axes, AxisSegment, Pose
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.screen_shape import shape_of
+from caustic_cli.optics.system import System
 from caustic_cli.scene import Aperture, CircularAperture, Component, Scene, Screen
 
 #: Rays of the source, and paths between two apertures: a fraction of light below one of them is nil.
@@ -130,9 +135,19 @@ class LightPath:
 
     def __init__(self, scene: Scene):
         self.elements, self.screen = _stations(scene)
+        self.receiver = Receiver.of(System.of(scene), scene.screen)
         self.sources = _sources(scene)
         self.emitted = _from_source(scene, [*self.elements, self.screen])
         self.ends = torch.quasirandom.SobolEngine(4, scramble=True, seed=0).draw(PATHS, dtype=torch.float64).numpy().T
+
+    def lit_face(self) -> float:
+        """Fraction of the paths from the last element to the screen that arrive at its lit face; 1 of a curved screen."""
+        if self.screen.screen.curved:
+            return 1.0
+        a, b, c, d = self.ends
+        last, normal = self.elements[-1], np.array(self.receiver.axes[2])
+        way = self.screen.points(c, d, 0.0) - last.points(a, b, last.depth[1])
+        return float((self.receiver.forward * (way @ normal) > 0).mean())
 
     def obstruction(self, shift: tuple[float, float] | None = None) -> Obstruction | None:
         """The body that obstructs most of the first part of the way which any obstructs, None if the light is free; shift: of the
@@ -158,12 +173,21 @@ class LightPath:
 
 
 def refuse_obstructed(scene: Scene, designed: bool = False) -> None:
-    """Refuse a scene in which a body stands in the light; designed: whether its lens is designed already, for this screen.
+    """Refuse a scene in which a body stands in the light, or in which light arrives at the back of the screen; designed: whether
+    its lens is designed already, for this screen.
 
     Raises:
         InputError: naming the body, the light, the fraction of it, and what would be accepted.
     """
-    found = LightPath(scene).obstruction()
+    way = LightPath(scene)
+    if (part := way.lit_face()) < 1.0:
+        last, beyond = way.elements[-1].name, "behind" if scene.behind else scene.lens.interaction.beyond
+        raise InputError(
+            f"the screen must lie {beyond} {last} and face it:"
+            f" {'its plane passes through it' if part else 'it turns its back to it'}, so that {100.0 * (1.0 - part):.3g}% of the"
+            " light would arrive from behind; accepted: less ⟨+screen.tilt⟩, or another ⟨+screen.shift⟩ or ⟨+throw⟩"
+        )
+    found = way.obstruction()
     if found is None:
         return
     if "the screen" in (found.body, found.behind):

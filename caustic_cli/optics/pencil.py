@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -64,6 +65,9 @@ class Bundle:
     def device(self) -> torch.device:
         """Where its points are."""
         return self.sample.device
+
+    #: Whether the fused kernel for them also reflects.
+    reflects: ClassVar[bool] = False
 
     def at_pupil(self) -> RayState:
         """As many rays through the entrance's aperture."""

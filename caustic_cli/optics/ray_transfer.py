@@ -17,6 +17,9 @@ from caustic_cli.optics.rays import Hit, RayState
 from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.scene import Aperture
 
+#: Distance along z, mm, from which rays meet a surface that touches their pupil: an intersection lies ahead of its ray.
+BEFORE = 1e-6
+
 
 def meet(tracer, m, heights: Tensor | None) -> None:
     """Transfer the rays of an `Interaction` to its surface, of these heights."""
@@ -32,7 +35,7 @@ def meet(tracer, m, heights: Tensor | None) -> None:
         return
     state = state.expanded()
     o, d = to_local(element.pose, state.origin, state.direction, state.datum)
-    if m.index == 0 and m.forward and prepared is None and _crosses_pupil(element, system):
+    if m.index == 0 and m.forward and prepared is None and not element.surface.flat:
         o, state = _moved_before_surface(tracer, o, d, state, element, heights)
     hit = _intersection(tracer, m, o, d, heights, prepared)
     if state.power.dtype != tracer.dtype:  # the first intersection is always computed in float64
@@ -64,11 +67,6 @@ def _at_pupil(system, m) -> bool:
     return e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z) and _is_pupil(e, system)
 
 
-def _crosses_pupil(element, system) -> bool:
-    """Whether the first surface may cross the pupil, which is then its own aperture."""
-    return system.lit is None and not element.surface.flat
-
-
 def _is_pupil(element, system) -> bool:
     """Whether an element's aperture is that of the pupil."""
     return element.aperture == system.pupil.aperture
@@ -82,12 +80,11 @@ def _passed(element, hit: Hit, valid: Tensor) -> Tensor:
 
 
 def _moved_before_surface(tracer, o, d, state: RayState, element, heights) -> tuple[tuple, RayState]:
-    """Rays on a pupil that intersects the first surface, moved back in front of it."""
-    low = element.surface.hull(heights)[0]
-    back = max(0.0, float(torch.as_tensor(o[2], dtype=torch.float64).max()) - low)
-    if back == 0.0:
+    """Rays on a pupil, moved back in front of the first surface where that intersects the pupil."""
+    back = float(torch.as_tensor(o[2], dtype=torch.float64).max()) - element.surface.hull(heights)[0]
+    if back < 0.0:
         return o, state
-    way = -back * (1.0 + 1e-9) / d[2]
+    way = -(back * (1.0 + 1e-9) + BEFORE) / d[2]
     moved = (torch.as_tensor(c + way * v, dtype=torch.float64) for c, v in zip(o, d, strict=True))
     path = state.path + tracer.media[0].index_at(state.wavelength) * way
     return tuple(c.expand(state.power.shape) for c in moved), replace(state, path=path)
@@ -120,8 +117,34 @@ def prepared_intersection(tracer) -> Callable[[Tensor], SurfaceIntersection] | N
         return sampled
     spread = start.expanded()
     full = spread.full((*spread.origin, *spread.direction))
-    origin = (full[0] - px, full[1] - py, full[2] + (start.datum - pz))
-    return tracer.backend.intersect_fixed(surface, origin, full[3:])
+    origin, direction = (full[0] - px, full[1] - py, full[2] + (start.datum - pz)), full[3:]
+    if first > 0:
+        return tracer.backend.intersect_fixed(surface, origin, direction)
+    return _from_afar(tracer, surface, origin, direction)
+
+
+def _from_afar(tracer, surface: HeightField, origin: tuple, direction: tuple) -> Callable[[Tensor], SurfaceIntersection]:
+    """Intersections of rays that may start on either side of a surface, which intersects their pupil: from half a width before it,
+    or from in front of a surface that reaches farther."""
+    room = max(surface.half_size)
+
+    def moved(by: float) -> tuple[Tensor, tuple]:
+        way = -by / direction[2]
+        return way, tuple(o + way * d for o, d in zip(origin, direction, strict=True))
+
+    back, starts = moved(room)
+    fixed, last = tracer.backend.intersect_fixed(surface, starts, direction), float(starts[2].max())
+
+    def met(heights: Tensor) -> SurfaceIntersection:
+        beyond = last - surface.hull(heights)[0]
+        if beyond < 0.0:
+            hit, way = fixed(heights), back
+        else:
+            way, far = moved(room + beyond + BEFORE)
+            hit = tracer.backend.intersect_spline(surface, heights, far, direction, 1.0)
+        return hit._replace(t=hit.t + way)
+
+    return met
 
 
 def _cast(value, dtype: torch.dtype):

@@ -97,13 +97,17 @@ class Receiver:
         """Pixels along x and y."""
         return self.screen.resolution
 
+    @property
+    def forward(self) -> float:
+        """1 where light arrives along its normal, -1 where it does so from the other side."""
+        return 1.0 if dot(self.axis, self.axes[2]) >= 0 else -1.0
+
     def land(self, backend, rays: RayState) -> tuple[RayState, Tensor]:
         """Ray transfer to it: the rays, expanded, with the screen's coordinates, mm, for x and y of their origins; and whether they
         arrive, (N,)."""
         rays = self._through_windows(rays.expanded())
         point = (self.middle[0], self.middle[1], self.middle[2] - rays.datum)
-        forward = 1.0 if dot(self.axis, self.axes[2]) >= 0 else -1.0
-        x, y, arrives = self.shape.land(backend, rays.origin, rays.direction, point, self.axes, forward)
+        x, y, arrives = self.shape.land(backend, rays.origin, rays.direction, point, self.axes, self.forward)
         if any(self.at):
             x, y = x + self.at[0], y + self.at[1]
         weight = torch.where(arrives, rays.power, torch.zeros_like(rays.power))

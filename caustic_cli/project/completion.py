@@ -195,7 +195,7 @@ def _missing_room(lens: LensSettings) -> float:
     """
     x, y = (np.array([0.0, width / 2.0]) for width in lens.size)
     lowest = lens.thickness + float(Offset(0.0, lens.radius).sag(x[:, None], y[None, :]).min())
-    short = lens.z_in + lens.min_thickness - lowest
+    short = interaction_of(lens.mirror).base(lens.z_in) + lens.min_thickness - lowest
     return short if short >= lens.height_range[1] else 0.0
 
 

@@ -94,7 +94,7 @@ class Scene:
         self.lens.interaction.check_screen(self.screen.z, self.lens.z_in)
         self.screen.check_curvature()
         self.screen.check_facing(self.undeviated)
-        if self.source.nearest >= self.lens.z_in:
+        if self.source.nearest >= min(self.lens.z_in, self.lens.pupil.z):
             raise InputError(
                 f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
                 f" got z = {self.source.nearest:g} mm"

@@ -49,6 +49,11 @@ class Aperture:
         return math.hypot(*self.half_size)
 
     @property
+    def on_edge(self) -> tuple[float, float]:
+        """A point whose x^2 and y^2 are their means along the edge, mm^2; on two sides of a rectangle at a time, that is."""
+        return self.half_size[0] * math.sqrt(2.0 / 3.0), self.half_size[1] * math.sqrt(2.0 / 3.0)
+
+    @property
     def area(self) -> float:
         """Area, mm^2."""
         return math.prod(self.half_size) * self.filled
@@ -122,6 +127,11 @@ class CircularAperture(Aperture):
     def reach(self) -> float:
         """The radius."""
         return self.half_size[0]
+
+    @property
+    def on_edge(self) -> tuple[float, float]:
+        """As of an aperture."""
+        return self.radius * math.sqrt(0.5), self.radius * math.sqrt(0.5)
 
     def distances(self, x, y) -> tuple[tuple[Any, float], ...]:
         """As of an aperture."""

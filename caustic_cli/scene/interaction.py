@@ -9,7 +9,7 @@ Notation
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -53,6 +53,10 @@ class Refracting:
 
     def base(self, z_in: float) -> float:
         """z that the surface must not fall below, mm: of the flat face where light enters."""
+        return z_in
+
+    def front(self, z_in: float, edge: Callable[[], float]) -> float:
+        """z of the aperture that a source illuminates, mm: of the entrance, or of the edge of the surface."""
         return z_in
 
     def entered(self, z_in: float, z: np.ndarray) -> np.ndarray:
@@ -135,6 +139,10 @@ class Reflecting(Refracting):
     def base(self, z_in: float) -> float:
         """None."""
         return -math.inf
+
+    def front(self, z_in: float, edge: Callable[[], float]) -> float:
+        """Of the edge."""
+        return edge()
 
     def entered(self, z_in: float, z: np.ndarray) -> np.ndarray:
         """At the surface itself."""

@@ -114,7 +114,7 @@ class Lens:
     degree: tuple[int, int] = default("lens.degree")
     #: (knots_u, knots_v) on [0, 1], or None for open equispaced ones.
     knots: tuple[Sequence[float], Sequence[float]] | None = None
-    #: Least distance of every control height from z_in, mm (4.1.2).
+    #: Least distance of every control height of a lens from z_in, mm (4.1.2).
     min_thickness: float = 0.0
     #: Base surface.
     offset: Offset = field(default_factory=Offset)
@@ -210,15 +210,28 @@ class Lens:
         """Its aperture."""
         return aperture_of(self.aperture, self.size, "lens.size")
 
-    @property
+    @cached_property
     def pupil(self) -> Pupil:
-        """Its aperture at the entrance."""
-        return Pupil(self.opening, self.z_in)
+        """Its aperture where light meets it first: at the entrance, or at the mean height of the edge of a mirror."""
+        return Pupil(self.opening, self.interaction.front(self.z_in, self._edge))
+
+    def _edge(self) -> float:
+        """Mean height of the edge of the base surface, mm, to second order."""
+        x, y = (np.array([c]) for c in self.opening.on_edge)
+        return self.offset.thickness + float(self.offset.sag(x, y)[0])
 
     @property
     def lowest(self) -> float:
-        """Lower bound of z over the entrance, mm."""
+        """Lower bound of z over the surface that light meets first, the entrance or a mirror, mm."""
+        if self.mirror:
+            corner = (np.array([c]) for c in self.half_size)
+            return self.offset.thickness + min(0.0, float(self.offset.sag(*corner).min())) + self.height_range[0]
         return self.z_in + (0.0 if self.entrance is None else min(0.0, float(self.entrance.heights.min())))
+
+    @property
+    def floor(self) -> float:
+        """z that no control height must fall below, mm: by the least thickness of a lens; a mirror has none."""
+        return self.interaction.base(self.z_in) + self.min_thickness
 
     @property
     def interior(self) -> Interior:
@@ -238,13 +251,13 @@ class Lens:
     def height_bounds(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the control heights at control points x (n,), y (m,): two (n, m) float64, mm.
 
-        With every height at least z_in + min_thickness the whole surface is, too, by the convex hull property (4.1.2).
+        With every height at least `floor` the whole surface is, too, by the convex hull property (4.1.2).
 
         Raises:
             InputError: the lower bound exceeds the upper one somewhere.
         """
         f = self.offset.heights(x, y)
-        low = np.maximum(f + self.height_range[0], self.z_in + self.min_thickness)
+        low = np.maximum(f + self.height_range[0], self.floor)
         high = f + self.height_range[1]
         if not (low < high).all():
             raise InputError(

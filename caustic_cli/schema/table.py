@@ -280,7 +280,7 @@ class LensSettings(Section):
             checks.LENGTH, default=0.0, why="the origin of the lens")
     thickness: float = setting("centre height of the base surface above the lens' origin", "mm", -checks.LENGTH, checks.LENGTH,
             derived="half the width of a lens up to 20 mm; for a wider one, a least wall of 3 mm; with two free-form sides twice"
-            " the width", why="table D.2 of the thesis; a plate is thin; two sides need a distance",
+            " the width; 0 of a mirror", why="table D.2 of the thesis; a plate is thin; two sides need a distance",
             option=Option("--thickness", "MM"))
     radius: Pair = setting("radii of the base surface along x and y; inf is flat, positive is diverging", "mm",
             derived="the sphere that spreads the light over the picture", why="table 6.1 of the thesis")
@@ -344,8 +344,8 @@ class ScreenSettings(Section):
     tilt: Numbers = setting("rotation of the screen about its own centre: about the fixed x axis, then about the fixed y axis;"
             " before both, by a third angle, about its normal", "degrees", -180.0, 180.0, default=[0.0, 0.0], written=False,
             option=Option("--screen-tilt", "A,B[,C]", BOTH))
-    shift: Pair = setting("decentre of the screen; by default that of a mirror is shifted out of the light of its source", "mm",
-            -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH))
+    shift: Pair = setting("decentre of the screen; by default on light that is tilted, and beside the light of the source of a"
+            " mirror", "mm", -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH))
     radius: Pair | None = setting("radii of curvature of a curved screen along x and y: the same for a sphere, inf along one axis"
             " for a cylinder; positive bends the edges towards +z, away from a lens", "mm", derived="plane", written=False,
             option=Option("--screen-radius", "R[,RY]", BOTH))

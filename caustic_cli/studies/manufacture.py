@@ -136,13 +136,13 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -
         bends = curvature.largest(*(lens.cut_from * d for d in derivatives))
         found.append(torch.stack([-z.min(), z.max(), torch.hypot(*derivatives[:2]).max(), bends.max()]))
     low, high, slope, bent = (float(m) for m in torch.stack(found).amax(0) * torch.tensor([-1.0, 1.0, 1.0, 1.0]))
-    reflected = (
-        "" if lens.mirror else f" (light along the axis is totally reflected from {1.0 / math.sqrt(lens.index**2 - 1.0):.2f})"
-    )
+    depths, reflected = f"{high - low:.2g} mm deep", ""
+    if not lens.mirror:
+        depths = f"wall {low - lens.z_in:.2f} mm, stock {high - lens.z_in:.2f} mm"
+        reflected = f" (light along the axis is totally reflected from {1.0 / math.sqrt(lens.index**2 - 1.0):.2f})"
     return (
-        f"first surface: wall {low - lens.z_in:.2f} mm, stock {high - lens.z_in:.2f} mm, slopes up to"
-        f" {slope:.2g}{reflected}, {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'};"
-        f" project about {_megabytes(project)}"
+        f"first surface: {depths}, slopes up to {slope:.2g}{reflected},"
+        f" {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'}; project about {_megabytes(project)}"
         f"{_thinner(scene, low, high)}"
     )
 

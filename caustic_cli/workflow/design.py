@@ -376,7 +376,7 @@ def _solved(project: Project, problem: OneSurface, fixed: bool) -> tuple[torch.T
 
 def _spare(lens: LensSettings, said: Given, first: torch.Tensor) -> float:
     """Excess thickness of a plate below its initial surface beyond the wall, which may be given, mm; 0 for another lens."""
-    if max(lens.size) <= PLATE:
+    if lens.mirror or max(lens.size) <= PLATE:
         return 0.0
     wall = lens.min_thickness if "min_thickness" in said.get("lens", {}) else WALL
     return max(0.0, float(first.min()) - lens.z_in - wall)
@@ -389,7 +389,7 @@ def _room(given: LensSettings, said: Given, first: torch.Tensor) -> dict[str, An
     x, y = (c.numpy() for c in offset.control_xy())
     base = lens.offset.heights(x, y)
     departure = 2.0 * float(np.abs(first.numpy() - base).max())
-    short = lens.z_in + lens.min_thickness - float(first.min())
+    short = lens.floor - float(first.min())
     fixed, changed = said.get("lens", {}), dict[str, Any]()
     if departure > lens.height_range[1] and "height_range" not in fixed:
         changed["height_range"] = (-departure, departure)

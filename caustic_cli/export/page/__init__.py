@@ -146,7 +146,7 @@ def _lens(lens: Lens) -> dict:
     """What the page needs of a lens or mirror beside its surface."""
     return {
         "size": list(lens.size),
-        "zIn": lens.z_in,
+        "zIn": lens.pupil.z,
         "round": lens.opening.round,
         "mirror": lens.mirror,
         "fresnel": ["none", "schlick", "exact"].index(lens.interior.fresnel),
@@ -267,7 +267,7 @@ def _source(scene: Scene, source: Source) -> dict:
     angles = 2.0 * np.arcsin(np.linspace(0.0, 1.0, ANGLES) * math.sin(0.5 * cone))
     return {
         "near": True,
-        "places": [[x, y, z - lens.z_in, float(part)] for (x, y, z), part in zip(places.tolist(), parts, strict=True)],
+        "places": [[x, y, z - lens.pupil.z, float(part)] for (x, y, z), part in zip(places.tolist(), parts, strict=True)],
         "extent": list(source.frame if source.brightness is not None else source.extent),
         "picture": _picture(source),
         "chord": 2.0 * math.sin(0.5 * cone),

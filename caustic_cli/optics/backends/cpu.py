@@ -6,6 +6,7 @@ The reference handles stages without a kernel, and empty sets of rays.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from functools import lru_cache
 from importlib import import_module
@@ -205,7 +206,7 @@ class Numba(Torch):
     def beam_image(
         self, field, beam: Beam, entrance: tuple[float, str], eta: float, fresnel: str, like: BeamImage | None
     ) -> BeamImage:
-        """The same for parallel rays at an angle to z."""
+        """The same for parallel rays at an angle to z, also of a mirror, whose eta is -1."""
         return BeamImage(field, beam, entrance, (eta, fresnel), like)
 
     def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
@@ -277,7 +278,9 @@ class BeamImage:
     tilts = True
 
     def __init__(self, field, beam: Beam, entrance: tuple[float, str], interface: tuple[float, str], like: BeamImage | None):
-        self.interface = interface
+        self.interface, (x, y, z) = interface, beam.direction
+        #: Of the light behind the exit, if it is flat.
+        self.axis = x, y, math.copysign(z, interface[0])
         #: Power through the pupil, and less what the entrance reflects, ().
         self.entering = torch.tensor(beam.emitted, dtype=torch.float64)
         self.passed = self.entering * beam.transmittance(*entrance)
@@ -287,7 +290,7 @@ class BeamImage:
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
         """Image, power that leaves the surface, and what was lost since the source; what misses the surface is the rest."""
         reference = float(heights.detach().mean())
-        receiver = Receiver.on_axis(screen, (0.0, 0.0, 1.0))
+        receiver = Receiver.on_axis(screen, self.axis)
         image, leaving, lost = self.kernel.onto(heights - reference, *self.interface, reference, receiver, filter)
         return image, leaving, _since_source(self, leaving, lost)
 

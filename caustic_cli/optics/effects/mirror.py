@@ -22,9 +22,10 @@ class Mirror(Effect):
         return Decision(self.name, False, "the surface is glass", fixed=True, present=False)
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
-        """The same surface as a mirror, with the screen at the same distance in front of it; None for a gradient-index lens."""
+        """The same surface as a mirror, with the screen where it is seen in it; None for a gradient-index lens."""
         if scene.lens.gradient is not None:
             return None
-        z = 2.0 * float(heights.mean()) - scene.screen.z
-        lens, screen = replace(scene.lens, mirror=True), replace(scene.screen, z=z)
+        z, tilt = 2.0 * float(heights.mean()) - scene.screen.z, scene.screen.tilt
+        tilt = (-tilt[0], -tilt[1], *tilt[2:])  # seen in it, the normal points the other way, too
+        lens, screen = replace(scene.lens, mirror=True), replace(scene.screen, z=z, tilt=tilt)
         return Probe(Scene(scene.source, lens, screen, scene.light), scene, f"the screen at {z:.4g} mm")

@@ -160,7 +160,7 @@ def irradiance(scene: Scene, x: np.ndarray, y: np.ndarray, height: float) -> np.
     inside = np.sqrt(1.0 - (d[:, 0] ** 2 + d[:, 1] ** 2) / (n * n))
     if lens.interior.fresnel != "none":
         part = part * (1.0 - reflectance("exact", d[:, 2], inside, 1.0 / n))
-    way = (height - lens.z_in) / (n * inside)
+    way = (height - lens.pupil.z) / (n * inside)
     cells, _, _ = np.histogram2d(at_x + way * d[:, 0], at_y + way * d[:, 1], (x, y), weights=part)
     lit = max(1, int(np.count_nonzero(cells)))
     sigma = math.sqrt(SMOOTHED * lit / (4.0 * math.pi * len(met)))

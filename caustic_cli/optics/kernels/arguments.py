@@ -18,8 +18,8 @@ from caustic_cli.scene import Screen
 class Exit(NamedTuple):
     """The exit surface and the screen behind it.
 
-    eta: ratio of the indices in front of and behind it; fresnel: kind of Fresnel losses, as in `refraction`; start: height
-    of the origins of oblique rays, height: of the screen, mm, both above the zero of the sag.
+    eta: ratio of the indices in front of and behind it, -1 for a mirror; fresnel: kind of Fresnel losses, as in `refraction`;
+    start: height of the origins of oblique rays, height: of the screen, mm, both above the zero of the sag.
     """
 
     eta: float
@@ -72,8 +72,8 @@ class ParallelLight(NamedTuple):
     """Parallel light behind a flat entrance, for the rays of `beam`, and the plane of the screen.
 
     kx, ky: k; long2: L^2; power: E T, 1/mm^2; over_x, over_y: 1 / half widths of the entrance, 1/mm; round: whether its aperture is
-    a circle; e1, e2, e3: axes of the screen, the third its normal; c1, c2, c3: a point of it along these, mm, where its coordinates
-    are 0, above the zero of the sag; on1, on2, on3: D along these.
+    a circle; e1, e2, e3: axes of the screen, the third normal to it; c1, c2, c3: a point of it along these, mm, where its
+    coordinates are 0, above the zero of the sag; on1, on2, on3: D along these.
     """
 
     kx: float

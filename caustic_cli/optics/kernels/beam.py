@@ -1,12 +1,13 @@
-"""Fused CPU kernel for parallel rays through points of the exit, onto a screen of any orientation: see
+"""Fused CPU kernel for parallel rays through points of the exit, or of a mirror, onto a screen of any orientation: see
 `optics.beam`, whose notation this is, and which is its plain-torch reference.
 
-Height and slopes come from `rows`.  With L^2 = |D|^2, M = D . N and n the ratio of the indices at the exit,
+Height and slopes come from `rows`.  With L^2 = |D|^2, M = D . N and n the ratio of the indices at the exit, -1 for a mirror,
 
-    S = sqrt(n^2 M^2 - (n^2 - 1) |N|^2 L^2),    Gamma = (1 - n^2) L^2 / (S + n M),    W = n D + Gamma N,
+    S = sqrt(n^2 M^2 - (n^2 - 1) |N|^2 L^2),    Gamma = (S - n M) / |N|^2,    W = n D + Gamma N,
 
-as in `pencil`, the ray leaves along W and lands t W away, at the screen's coordinates (p + t W - c) . e1 and . e2, with
-t = (c - p) . e3 / W . e3, from its point p of the exit, where c is a point of the screen and e1, e2, e3 its axes.
+the ray leaves along W, or against it from a mirror, and lands at p + t W, at the screen's coordinates (p + t W - c) . e1 and . e2,
+with t = (c - p) . e3 / W . e3, from its point p of the exit, where c is a point of the screen and e1, e2, e3 its axes, with
+W . e3 > 0.
 """
 
 from __future__ import annotations
@@ -58,10 +59,10 @@ def _aim(w, count, exit_, frame, beam):
         norm2, m, s, lit, passes = _bend(w, j, beam, n, exit_.start)
         reflected, _, _, _, _ = reflectance(exit_.fresnel, n, norm2 * beam.long2, m, s, 0.5)
         flux = w[AREA, j] * beam.power * m if lit else 0.0
-        gamma = (1.0 - n) * (1.0 + n) * beam.long2 / (s + n * m)
+        gamma = (s - n * m) / norm2
         down = _along(gamma, zx, zy, n, e3, beam.on3)
         away = beam.c3 - x * e3.x - y * e3.y - z * e3.z
-        arrives = (down > PARALLEL) & (away > 0.0)
+        arrives = (down > PARALLEL) & (n * away > 0.0)
         t = away / (down if arrives else 1.0)
         px = (x * e1.x + y * e1.y + z * e1.z - beam.c1 + t * _along(gamma, zx, zy, n, e1, beam.on1) - frame.low_x) / frame.pixel_x
         w[OUT_FLUX, j] = flux
@@ -113,11 +114,11 @@ def _pull(w, count, exit_, beam):
         loss = -by_power * density * m
         by_m, by_s, by_both = by_power * density * (1.0 - reflected) + loss * r_m, loss * r_s, loss * r_norm2  # both: |N|^2 L^2
         # landing point
-        under = 1.0 / (s + n * m)
-        gamma = (1.0 - n) * (1.0 + n) * long2 * under
+        over_norm2 = 1.0 / norm2
+        gamma = (s - n * m) * over_norm2
         down = _along(gamma, zx, zy, n, e3, beam.on3)
         away = beam.c3 - x * e3.x - y * e3.y - z * e3.z
-        arrives = (down > PARALLEL) & (away > 0.0)
+        arrives = (down > PARALLEL) & (n * away > 0.0)
         over = 1.0 / (down if arrives else 1.0)
         by_x, by_y = by_x if arrives else 0.0, by_y if arrives else 0.0
         t = away * over
@@ -127,9 +128,10 @@ def _pull(w, count, exit_, beam):
         by_nx, by_ny = by_1 * e1.x + by_2 * e2.x + by_3 * e3.x, by_1 * e1.y + by_2 * e2.y + by_3 * e3.y
         by_gamma = by_1 * e1.z + by_2 * e2.z + by_3 * e3.z - zx * by_nx - zy * by_ny
         # Gamma and S
-        by_s = (by_s - gamma * by_gamma * under) / s
-        by_m += by_s * n * n * m - n * gamma * by_gamma * under
-        by_norm2 = (by_both + by_s * (1.0 - n) * (1.0 + n) * 0.5) * long2
+        by_gamma *= over_norm2
+        by_s = (by_s + by_gamma) / s
+        by_m += n * (by_s * n * m - by_gamma)
+        by_norm2 = (by_both + by_s * (1.0 - n) * (1.0 + n) * 0.5) * long2 - gamma * by_gamma
         meets = lit & passes
         w[OUT_Z, j] = by_x * e1.z + by_y * e2.z - by_away * e3.z if meets else 0.0
         w[OUT_ZX, j] = 2.0 * zx * by_norm2 - beam.kx * by_m - gamma * by_nx if meets else 0.0

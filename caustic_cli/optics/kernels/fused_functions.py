@@ -121,22 +121,21 @@ class BeamKernel(PlaneKernel):
     def __init__(self, spaces, half_size, beam: Beam, entrance: tuple[float, str], like: BeamKernel | None = None):
         sample = beam.sample
         super().__init__(spaces, half_size, sample.u, sample.v, sample.tensor, sample.flux, like)
-        self.direction, self.z_in, (self.kx, self.ky) = beam.direction, beam.z_in, beam.inside(entrance[0])
-        self.half_size = beam.aperture.half_size
+        self.z_in, (self.kx, self.ky), self.half_size = beam.z_in, beam.inside(entrance[0]), beam.aperture.half_size
         self.round, self.power = bool(beam.aperture.round), beam.irradiance * beam.transmittance(*entrance)
 
     def onto(self, sag: Tensor, eta: float, fresnel: str, reference: float, receiver: Receiver, filter: Filter):
         """Control heights (n, m) float64 relative to `reference`, mm: see `_splat`."""
-        light, frame = (None, self._light(receiver, reference)), ScreenFrame.of(receiver.screen, receiver.low)
+        light, frame = (None, self._light(receiver, reference, eta)), ScreenFrame.of(receiver.screen, receiver.low)
         ends = self.z_in - reference, 0.0
         return self._splatted(sag, (eta, fresnel), ends, receiver.screen, filter, light, frame)
 
-    def _light(self, receiver: Receiver, reference: float) -> ParallelLight:
+    def _light(self, receiver: Receiver, reference: float, eta: float) -> ParallelLight:
         kx, ky = self.kx, self.ky
         middle = (*receiver.middle[:2], receiver.middle[2] - reference)
-        along_x, along_y, normal = receiver.axes
-        forward = 1.0 if dot(normal, self.direction) > 0 else -1.0
-        axes = along_x, along_y, (forward * normal[0], forward * normal[1], forward * normal[2])  # the last in the way of the light
+        along, up, (x, y, z) = receiver.axes
+        normal = (x, y, z) if eta * dot(receiver.axis, (x, y, z)) > 0 else (-x, -y, -z)
+        axes = along, up, normal
         e1, e2, e3 = (Components(*map(float, axis)) for axis in axes)
         c1, c2, c3 = (float(dot(middle, axis)) for axis in axes)
         on1, on2, on3 = (float(dot((kx, ky, 1.0), axis)) for axis in axes)
