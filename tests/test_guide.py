@@ -70,7 +70,7 @@ def home(tmp_path_factory):
         for name, value in SMALL.items():
             patch.setenv(name, value)
         os.chdir(directory)
-        for name in ("flame.png", "tophat.png", "ball.png", "house.png", "array-sheet.png", "array-wanted.png"):
+        for name in ("flame.png", "tophat.png", "ball.png", "house.png", "array-sheet.png", "array-wanted.png", "dial.png"):
             shutil.copy(ROOT / "examples" / name, directory)
         shutil.copytree(ROOT / "examples" / "thesis", directory / "thesis")
         for name in ("globe.toml", "folded.toml"):
@@ -95,7 +95,10 @@ def test_the_commands_of_a_chapter_run(chapter, home, monkeypatch, capfd):
     for arguments in commands(chapter):
         few = ["2e4" if k and arguments[k - 1] == "--rays" and float(a) > 2e4 else a for k, a in enumerate(arguments)]
         where = few.index("2>") if "2>" in few else len(few)
+        if "--screen" in few or "window-floor" in few or "sundial" in few:  # which say where the screen is
+            monkeypatch.delenv("CAUSTIC_DESIGN_THROW")
         status = cli.run(few[:where])
+        monkeypatch.setenv("CAUSTIC_DESIGN_THROW", SMALL["CAUSTIC_DESIGN_THROW"])
         assert status == 0, f"caustic {shlex.join(arguments)}\n{capfd.readouterr().err}"
 
 

@@ -44,6 +44,9 @@ def test_a_preset_gives_way_to_a_configuration_and_both_to_options(capfd):
     assert s.lens.size == (100.0, 100.0) and s.source.angle == 0.533  # the preset's
     assert s.target.size[0] == 250.0 and s.lens.index == 1.6 and "glass" not in s.lens  # the configuration's
     assert s.screen.z == 800.0  # the option's
+    assert cli.run(["design", "blob.png", "--preset", "window-floor", "--throw", "80cm", "--mag", "2", *SMALL, "-o", "w"]) == 0
+    s = Project.open("w").settings
+    assert s.screen.z == 800.0 and s.target.size[0] == 200.0 and s.room.faces == 180.0  # instead of its place and its size
     assert cli.run(["design", "--resume", "blob.caustic", "--preset", "thesis"]) == 2
     assert "--preset cannot be given" in capfd.readouterr().err
     assert cli.run(["design", "blob.png", "--preset", "plate100"]) == 2

@@ -134,7 +134,7 @@ def design(*options: str, picture: str = "blob.png") -> int:
     return cli.run(["design", picture, "--waves", "off", "--quality", "draft", "--resolution", "24", "-o", "p", *options])
 
 
-@pytest.mark.parametrize("place", ["floor:1m", "floor:1m,90", "wall:1m,60"])
+@pytest.mark.parametrize("place", ["floor:1m", "floor:1m,90", "wall:1m,0", "wall:500,270"])
 def test_designs_in_a_room(in_tmp, capfd, place):
     """A picture without symmetry appears on floor and wall as it was given."""
     x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 24)] * 2, indexing="ij")

@@ -191,8 +191,8 @@ def named(text: str) -> str:
     """A text with marks replaced by option names, or by names of project.toml where no option was used."""
 
     def name(path: str) -> str:
-        row = TABLE.get(path[1:]) if path.startswith("+") else None
-        if row and row.option:
+        row = TABLE.get(path.removeprefix("+"))
+        if row and row.option and (path.startswith("+") or not row.section):
             return row.option.name
         return _option_names.get(path) or (plain_name(path) if "." in path or path in LISTS else "--" + path.replace("_", "-"))
 

@@ -159,6 +159,10 @@ brightness (power on the picture over that of the design, in a beam of the same 
 where it stands); periods as_designed, legible and on_screen, each with its first and last time; the error of the design;
 as_designed_error and legible_error, the bounds; film, plot.
 .TP
+.B hours
+For a sundial: relative_rms of all light on the screen at the time of each lenslet against its picture, and contrast, of its own
+light to that of the others on the bright part of the picture; in the order of the lenslets. hours_image: all images as a sheet.
+.TP
 .B want
 For an array with a prescribed illumination: brightness of each lenslet's source relative to the largest, N lists of M; error, the
 relative RMS error of the resulting image; kkt_residual; power, as a fraction of what all sources would require; image.

@@ -71,7 +71,7 @@ def complete_sunlight(source: SourceSettings, room: RoomSettings | None, array: 
     if len(times) == 1:
         return _of_sun(source, type, light, times[0])
     if source.also and len(source.also) != len(times) - 1:
-        raise InputError(f"⟨source.also⟩: the sun of {len(times)} lenslets has as many [[source]], got {len(source.also) + 1}")
+        raise InputError(f"[[source]]: the sun of {len(times)} lenslets has as many [[source]], got {len(source.also) + 1}")
     (n, m), first = array, source.without("also")
     each = [first, *(source.also or [first.without(*FIRST)] * (len(times) - 1))]
     read = [times[(m - 1 - j) * n + i] for i in range(n) for j in range(m)]  # as the pictures of a sheet are read, row by row

@@ -81,6 +81,8 @@ TABLES = {
     ("element", "list"): ("element", ELEMENT),
     ("source", "also"): ("source", {k: v for k, v in SCHEMA["source"].items() if k not in FIRST}),
 }
+#: Section and keys of which one says what another would: a preset gives way to either.
+ALTERNATIVES = (("lens", "index", "glass"), ("", "throw", "screen_place"), ("", "mag", "picture_size"))
 #: Parameters from which settings are derived, such as mag: allowed in a configuration, before its first section, but not in a
 #: project.
 PARAMETERS = {key: row for key, row in in_section("").items() if row.kind != "tables"}
@@ -531,12 +533,13 @@ def implied(given: Given) -> Given:
 
 
 def merged(first: Given, *others: Given) -> Given:
-    """Given merged key by key, later ones taking precedence; an index replaces a glass, and vice versa."""
+    """Given merged key by key, later ones taking precedence; of ALTERNATIVES, one replaces the others."""
     out = {section: dict(table) for section, table in first.items()}
     for other in others:
-        if {"index", "glass"} & {*other.get("lens", {})}:
-            for key in ("index", "glass"):
-                out.get("lens", {}).pop(key, None)
+        for section, *keys in ALTERNATIVES:
+            if {*keys} & {*other.get(section, {})}:
+                for key in keys:
+                    out.get(section, {}).pop(key, None)
         for section, table in other.items():
             out[section] = out.get(section, {}) | table
     return out

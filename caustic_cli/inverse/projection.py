@@ -93,7 +93,8 @@ class ScreenProjection:
     def land(self, origin, direction) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Intersection of rays, components (N,) float64 or numbers, with the screen: x, y (N,) mm, and whether they reach it."""
         s = self.screen
-        forward = self.forward if s.axes[2][2] >= 0 else -self.forward
+        x, y, z = s.centre
+        forward = math.copysign(1.0, float(np.dot(s.axes[2], (x, y, z - self.centre_z))))  # as the light meets its normal
         return shape_of(s).land(Torch(), origin, direction, (*s.shift, s.z), s.axes, forward)
 
     def projected_target(self, target: np.ndarray) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from operator import mul
 
 import numpy as np
 import torch
@@ -34,6 +35,8 @@ from caustic_cli.schema.table import TABLE
 SHARP = 0.1
 #: Bisections of the bracket, at first of ratio 2, to 5 %; and most doublings to find it.
 HALVINGS, DOUBLINGS = 4, 7
+#: Cosine between light and a screen's normal from which on the screen counts as square to the light.
+SQUARE = 0.999
 #: Iterations of a deconvolution, whose error is then within a few per cent of the least.
 STEPS = 80
 #: Approximate number of pixels along an axis for the search: a relevant blur is wider than these.
@@ -122,7 +125,8 @@ def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spr
     larger = float(f"{f * lens.size[0]:.3g}")
     if reached(higher, scene.screen.z):
         ways.append(f"⟨+mag⟩ {higher:g} instead of {mag:.2g}")
-    if abs(throw) / f > 2.0 * (middle - lens.z_in) and reached(mag, nearer):
+    square = abs(sum(map(mul, scene.undeviated, scene.screen.axes[2]))) > SQUARE  # else it stands in a room
+    if square and abs(throw) / f > 2.0 * (middle - lens.z_in) and reached(mag, nearer):
         ways.append(f"⟨+throw⟩ {abs(nearer):g} instead of {abs(scene.screen.z):.3g} mm")
     if larger * max(1.0, mag) <= TABLE["lens.size"].high and reached(mag, scene.screen.z, larger):
         ways.append(f"a lens of {larger:g} mm")
