@@ -27,7 +27,7 @@ DECIMALS = 9
 NAMES = ("floor", "ceiling", "wall")
 
 
-class Plane(NamedTuple):
+class RoomPlane(NamedTuple):
     """A plane in the lens' frame: a point of it, mm, its unit normal towards the viewer, and the upward direction, a unit vector in
     it; at: whether the point is the picture's centre, which otherwise is where the light meets the plane."""
 
@@ -76,7 +76,7 @@ def placed(text: str, room: Room, light: Vector, side: int) -> Placement:
     return Placement(z, (a, b, c) if c else (a, b), (x, y))
 
 
-def _named(text: str, room: Room, side: int) -> Plane:
+def _named(text: str, room: Room, side: int) -> RoomPlane:
     """A floor or ceiling whose picture has its top on the lens' side, so that one who faces the lens sees it upright; or a wall,
     opposite the pane unless its azimuth says otherwise."""
     name, _, rest = text.partition(":")
@@ -92,7 +92,7 @@ def _named(text: str, room: Room, side: int) -> Plane:
     return _in_lens(room, _times(-distance, upward), upward, along, False)
 
 
-def _explicit(text: str, room: Room) -> Plane:
+def _explicit(text: str, room: Room) -> RoomPlane:
     """A plane with its point, normal and upward direction."""
     parts = [part.strip() for part in text.split(";")]
     in_room = parts[0] == "room"
@@ -107,11 +107,11 @@ def _explicit(text: str, room: Room) -> Plane:
         raise InputError(f"⟨screen_place⟩ {text}: up must not be along the normal")
     if in_room:
         return _in_lens(room, point, normal, _unit((x, y, z), text), True)
-    return Plane(point, normal, _unit((x, y, z), text), True)
+    return RoomPlane(point, normal, _unit((x, y, z), text), True)
 
 
-def _in_lens(room: Room, point: Vector, normal: Vector, up: Vector, at: bool) -> Plane:
-    return Plane(room.to_lens(point), room.to_lens(normal), room.to_lens(up), at)
+def _in_lens(room: Room, point: Vector, normal: Vector, up: Vector, at: bool) -> RoomPlane:
+    return RoomPlane(room.to_lens(point), room.to_lens(normal), room.to_lens(up), at)
 
 
 def _vector(text: str, whole: str) -> Vector:

@@ -101,7 +101,7 @@ class Instant:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Looked:
     """An instant with its images, (n_x, n_y) or (3, n_x, n_y), power per pixel over that of the beam at normal incidence: on the
     followed screen, and around the screen where it stands."""
 
@@ -153,10 +153,10 @@ class Follower:
 
     @property
     def white(self) -> np.ndarray:
-        """The image of the design, on the scale of `Seen`."""
+        """The image of the design, on the scale of `Looked`."""
         return self._image * self.scene.source.axis[2]
 
-    def at(self, time: datetime) -> Seen:
+    def at(self, time: datetime) -> Looked:
         """The picture at a time at which the sun shines through the pane.
 
         Raises:
@@ -179,7 +179,7 @@ class Follower:
             self._on_picture(image) * cosine / self._power if self._power else 0.0,
             lands / whole if whole else 0.0,
         )
-        return Seen(instant, image * cosine, around * cosine)
+        return Looked(instant, image * cosine, around * cosine)
 
     def _where_it_stands(self, scene: Scene, landing: Landing) -> tuple[np.ndarray, list[Image] | None]:
         """Image around the screen where it stands, and halves of that on it; black and None where no light comes near it."""
@@ -314,7 +314,7 @@ def hours_of_sun(light: Sunlight, day: date, zone: tzinfo | None) -> Hours:
 def follow_day(
     follower: Follower,
     shines: Hours,
-    keep: Callable[[Seen], T],
+    keep: Callable[[Looked], T],
     progress: Callable[[str, int, int], None] = lambda what, done, whole: None,
 ) -> tuple[Day, list[T]]:
     """The hours of sun of a day in steps of STEP minutes, and in shorter ones while light is on the screen and where the picture

@@ -95,7 +95,7 @@ class DayOfSunlight(Output):
         say.table(f"the sun on {self.day}", [*study.rows(found), ("film and plot", f"{found['film']}, {found['plot']}")])
 
 
-def _frame(follower: study.Follower, encoding: str, seen: study.Seen) -> Image.Image:
+def _frame(follower: study.Follower, encoding: str, seen: study.Looked) -> Image.Image:
     """The plane of the screen, with the outline of the screen, beside the picture that is followed."""
     scene, i = follower.scene, seen.instant
     white = white_level(follower.white, follower.target)
