@@ -181,11 +181,12 @@ def refuse_obstructed(scene: Scene, designed: bool = False) -> None:
     """
     way = LightPath(scene)
     if (part := way.lit_face()) < 1.0:
+        tilt, place = "less ⟨+screen.tilt⟩, or " * any(scene.screen.tilt), "⟨screen_at⟩" if designed else "⟨+throw⟩"
         last, beyond = way.elements[-1].name, "behind" if scene.behind else scene.lens.interaction.beyond
         raise InputError(
             f"the screen must lie {beyond} {last} and face it:"
             f" {'its plane passes through it' if part else 'it turns its back to it'}, so that {100.0 * (1.0 - part):.3g}% of the"
-            " light would arrive from behind; accepted: less ⟨+screen.tilt⟩, or another ⟨+screen.shift⟩ or ⟨+throw⟩"
+            f" light would arrive from behind; accepted: {tilt}another ⟨+screen.shift⟩ or {place}"
         )
     found = way.obstruction()
     if found is None:

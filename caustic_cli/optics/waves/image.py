@@ -197,7 +197,8 @@ def image_of(
     by_source: dict[int, list[Line]] = {}
     for line in lines:
         by_source.setdefault(id(line.system.source), []).append(line)
-    with backend_for(next(iter(parameters.values())).device).keeping_surfaces():
+    device = next((heights.device for heights in parameters.values()), "cpu")
+    with backend_for(device).keeping_surfaces():
         for light in by_source.values():
             imager = Imager.of(
                 light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=perturbation is not None
