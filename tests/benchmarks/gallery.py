@@ -1,4 +1,4 @@
-"""The gallery: ten lenses of different kinds, designed by whole commands, with their pictures, times and figures.
+"""The gallery: eleven lenses of different kinds, designed by whole commands, with their pictures, times and figures.
 
     python tests/benchmarks/gallery.py [--only NAME,...] [--quality draft|standard|fine] [-o DIR]
 
@@ -30,6 +30,11 @@ LENSES = {
     "disc": ("A disc of 5 mm at 1 m", "ball", "--source disc --source-size 5 --source-position 0,0,-1000"),
     "plate": ("A 100 mm acrylic plate in sunlight, wall at 0.5 m", "portrait", "--preset plate-100"),
     "mirror": ("A 100 mm mirror in sunlight from the side, wall at 1 m in front of it", "flame", "--preset mirror-100"),
+    "window": (
+        "A plate in a south window at an equinox, its picture on the floor below",
+        "flame",
+        "--preset window-floor",
+    ),
     "led": ("A luminaire lens, 60 mm from an LED, wall at 2 m", "tophat", "--preset led-30"),
     "laser": ("A round lens in a laser beam, screen at 1 m", "flame", "--preset laser-25"),
     "print": ("A lens of printing resin, 500 mm from a small LED, wall at 300 mm", "portrait", "--preset print-50"),
