@@ -2,16 +2,23 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.projection import seen_by_light
-from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
+from caustic_cli.inverse.source_limits import points_of
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.spread import spread_at
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.trace import expose
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.room import Room
 from caustic_cli.scene.room_screen import placed
 from caustic_cli.scene.screen import tilt_to, tilted
@@ -167,3 +174,26 @@ def test_nonsense_is_refused_in_a_line(in_tmp, capfd, options, words):
     assert design(*options) == 2
     error = capfd.readouterr().err
     assert words in error.splitlines()[-1] and "Traceback" not in error
+
+
+@pytest.mark.parametrize("place", ["floor:1000", "floor:1000,90", "wall:500,270", "wall:1000,0"])
+def test_the_blur_of_the_sun_on_floor_and_wall(place):
+    """Of a smooth lens, the image of the sun's centre convolved with it is the image in sunlight; a turned one has no parts."""
+    source = Disc(angle=2.0, tilt=(40.0, 20.0))
+    at = placed(place, SOUTH, source.axis, 1)
+    lens = Lens((30.0, 30.0), control=(16, 16), degree=(3, 3), offset=Offset(3.0, (150.0, 150.0)))
+    scene = Scene(source, lens, Screen((400.0, 400.0), at.z, (50, 50), at.tilt, at.shift))
+    field = HeightField.of(lens)
+    heights = torch.from_numpy(lens.offset.heights(*(c.numpy() for c in field.control_xy())))
+    spread = spread_at(scene, field, heights)
+    blur = spread.on(scene.screen.pixel)
+    aside = [-(-n // blur.cut) for n in blur.beside]
+    grown = scene.screen.grown((aside[0], aside[1]))
+    fine = replace(grown, resolution=(grown.resolution[0] * blur.cut, grown.resolution[1] * blur.cut))
+    centre = replace(scene, source=source.pointlike(), screen=fine)
+    image = expose(centre, field, heights, rays_of(centre, "stratified", 400_000)).image
+    seen = expose(scene, field, heights, rays_of(scene, "sobol", 1 << 19)).image.numpy()
+    found = blur(image).numpy()
+    assert found.sum() == pytest.approx(seen.sum(), rel=5e-3)
+    assert np.linalg.norm(found - seen) < 0.12 * np.linalg.norm(seen)
+    assert spread.turned and points_of(spread) == 1
