@@ -25,8 +25,6 @@ from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene, Source
 
-#: Cosine between an axis of the source and its image from which on they count as the same.
-STRAIGHT = 0.999
 #: Quantile of the deviation that `usual` is.
 MOST = 0.8
 #: Points along each axis of the pupil at which the shifts are measured.
@@ -61,17 +59,17 @@ class Spread:
     frame: tuple[float, float] = (0.0, 0.0)
     #: Of an image that is sheared (a, b): a point (x, y) of the image as given by the other fields lies at (x + a y, y + b x).
     skew: tuple[float, float] = (0.0, 0.0)
-    #: Whether x and y are not those of the source, which is round: its parts cannot be told apart then.
+    #: Whether x and y are nearer to the source's y and x: parts of the source cannot be told apart then.
     turned: bool = False
 
     @classmethod
     def of(cls, source: Source, by: np.ndarray, error: float = 0.0, usual: float = 0.0) -> Spread:
         """That of a source whose points land displaced by the matrix `by`, (2, 2): mm per mm, or per direction sine."""
-        turn = np.eye(2)
         frame, half = source.frame, [math.sin(source.half_angle)] * 2 if source.distant else source.extent
-        if source.even and half[0] == half[1]:  # a round source looks the same turned: without the rotation, in polar decomposition
-            u, s, v = np.linalg.svd(by)
-            by, turn = (u * s) @ u.T, u @ v
+        exchanged = abs(by[0, 0] * by[1, 1]) < abs(by[0, 1] * by[1, 0])
+        if exchanged and source.even and half[0] == half[1]:  # a round source looks the same turned: polar decomposition
+            u, s, _ = np.linalg.svd(by)
+            by = (u * s) @ u.T
         sx, sy = (float(c) for c in np.diag(by))
         skew = tuple(float(by[i, 1 - i]) / s if s else 0.0 for i, s in ((0, sy), (1, sx)))
         places: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 1.0),)
@@ -88,7 +86,7 @@ class Spread:
             source.brightness,
             (sx * frame[0], sy * frame[1]),
             (skew[0], skew[1]),
-            bool(turn[0, 0] < STRAIGHT or turn[1, 1] < STRAIGHT),
+            bool(exchanged),
         )
 
     def reach(self) -> tuple[float, float]:
@@ -133,8 +131,8 @@ class Spread:
         """
         if self.brightness is None:
             rx, ry = (math.sqrt(max(0.0, h * h - 2.0 / 3.0 * w * w)) for h, w in zip(self.half, cell, strict=True))
-            half = rx, ry
-            x, y = _even_disc(half, cell)
+            x, y = _even_disc((rx, ry), cell)
+            half = math.copysign(rx, self.frame[0]), math.copysign(ry, self.frame[1])
             light = np.full(len(x), 1.0 / len(x))
         else:
             half = self.frame
