@@ -244,6 +244,17 @@ class _TruncatedSurface:
     potential: np.ndarray
 
 
+def _rough_surface(scene: Scene, target: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Heights of a first surface on ROUGH cells in tilted light, as a function of places x (n,), y (m,), mm: (n, m)."""
+    lens = scene.lens
+    begun = _in_aperture(lens) if lens.mirror else lens.offset.heights
+    rough = _Grid.of(scene, target, ROUGH, begun)
+    solved = rough.solved(*rough.incident(begun(*rough.places)), float(rough.offset.mean())).heights
+    if lens.mirror:  # with its edge in the aperture of the light, none of which then passes it
+        solved = solved + lens.pupil.z - _edge(solved, slopes_inside(scene.source.axis, 1.0))
+    return extended(*rough.places, solved)
+
+
 def first_surface(
     scene: Scene,
     target: np.ndarray,
@@ -276,12 +287,7 @@ def first_surface(
     grid, lens = _Grid.of(scene, target, cells // times), scene.lens
     z = grid.offset
     if scene.source.oblique:  # the shadow of the lens' sides depends on the heights
-        begun = _in_aperture(lens) if lens.mirror else lens.offset.heights
-        rough = _Grid.of(scene, target, ROUGH, begun)
-        solved = rough.solved(*rough.incident(begun(*rough.places)), float(rough.offset.mean())).heights
-        if lens.mirror:  # with its edge in the aperture of the light, none of which then passes it
-            solved = solved + lens.pupil.z - _edge(solved, slopes_inside(scene.source.axis, 1.0))
-        surface = extended(*rough.places, solved)
+        surface = _rough_surface(scene, target)
         grid = _Grid.of(scene, target, cells // times, surface)
         z = surface(*grid.places)
     if scene.source.distant or lens.mirror or scene.elements:

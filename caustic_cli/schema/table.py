@@ -521,8 +521,9 @@ class Parameters(Section):
 
     throw: float | None = setting("distance from the lens' origin to the screen, in front of a mirror", "mm", -1e12, 1e12,
             derived="300", option=Option("--throw", "MM"), speaks_for=("screen.z",), before="screen.z")
-    screen_place: str | None = setting("part of a room as the screen, where the light meets it: floor, ceiling or wall and its"
-            " distance from the lens, or any plane by a point, its normal towards the viewer and an upward direction",
+    screen_place: str | None = setting("part of a room as the screen, where the light meets it: floor:1m, ceiling:1m or wall:2m,"
+            " which may have ,AZIMUTH of the picture's top or of the wall; or any plane, point=X,Y,Z;normal=X,Y,Z;up=X,Y,Z, the"
+            " normal towards the viewer, with room; before it for east, north and up",
             derived="square to the light", option=Option("--screen", "PLACE"),
             speaks_for=("screen.z", "screen.tilt", "screen.shift"), before="screen.z")
     screen_size: Pair | None = setting("full width and height of the screen; a single length keeps the picture's aspect ratio",

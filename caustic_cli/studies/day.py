@@ -304,7 +304,7 @@ def hours_of_sun(light: Sunlight, day: date, zone: tzinfo | None) -> Hours:
     """When the sun shines through the pane on a day.
 
     Raises:
-        InputError: never.
+        InputError: it does at no time.
     """
     if found := hours(light.shines, day, zone):
         return found
