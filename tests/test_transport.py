@@ -7,6 +7,7 @@ from scipy.sparse import coo_matrix
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse import surface_from_map, transport
+from caustic_cli.inverse.scattered import Pixels, Scattered
 from caustic_cli.optics.kernels import laguerre
 from caustic_cli.optics.kernels.multigrid import Multigrid
 
@@ -357,3 +358,45 @@ def test_the_average_does_not_depend_on_strips(monkeypatch):
     strips = solve(flame())
     np.testing.assert_array_equal(strips.potential, whole.potential)
     np.testing.assert_array_equal(strips.y, whole.y)
+
+
+def scattered(n=300, half=(1.0, 0.8)):
+    """Point masses anywhere, and prices of which some leave cells empty."""
+    g = np.random.default_rng(5)
+    y = g.normal(size=(2, n)) * np.array([[0.7], [0.5]])
+    sites = Scattered(*y, np.full(n, 1.0 / n), half, y)
+    return sites, 0.5 * (y * y).sum(0) + 0.02 * g.normal(size=n)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 300])
+def test_the_envelope_of_scattered_sites(n):
+    sites, psi = scattered(n)
+    if n == 3:  # on one line
+        sites = Scattered(np.zeros(3), np.array([0.3, -0.2, 0.0]), sites.mass, sites.half, np.zeros((2, 3)))
+    x1, x2 = transport.centres(31, 1.0), transport.centres(27, 0.8)
+    planes = x1[:, None, None] * sites.y1 + x2[None, :, None] * sites.y2 - psi
+    phi, site = sites.envelope(psi).on(x1, x2)
+    np.testing.assert_array_equal(site, planes.argmax(-1))
+    np.testing.assert_allclose(phi, planes.max(-1), rtol=0, atol=1e-14)
+    back, at = sites.prices(phi, [x1, x2])
+    planes = sites.y1 * x1[:, None, None] + sites.y2 * x2[None, :, None] - phi[:, :, None]
+    np.testing.assert_allclose(back, planes.reshape(-1, n).max(0), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(planes.reshape(-1, n)[at, np.arange(n)], back, rtol=0, atol=1e-14)
+
+
+def test_displaced_sites():
+    """By a constant: the same map, displaced.  By a field: light lands where the displaced pixels are."""
+    target = smooth((40, 30))
+    sites = Pixels(target, (C, D)).sites(np.ones((64, 48)), (A, B))
+    known = solve(target)
+    same = transport.solve_displaced(np.ones((64, 48)), sites, (A, B), known.potential, np.full((2, 65, 49), 0.37), tolerance=1e-4)
+    inner = (slice(3, -3), slice(3, -3))
+    assert same.error < 1e-4
+    for got, want in ((same.x, known.x), (same.y, known.y)):
+        np.testing.assert_allclose((got + 0.37)[inner], want[inner], atol=0.15)
+    x, y = corners(64, 48)
+    field = np.stack(np.broadcast_arrays(0.02 * y * y + 0.0 * x, 0.03 * x * y))
+    found = transport.solve_displaced(np.ones((64, 48)), sites, (A, B), known.potential, field, tolerance=1e-4)
+    got = image(*(fine(c, 1600) for c in (found.x + field[0], found.y + field[1])), target.shape, (C, D))
+    plain = image(*(fine(c, 1600) for c in (known.x, known.y)), target.shape, (C, D))
+    assert difference(got, target) < 1.1 * difference(plain, target)

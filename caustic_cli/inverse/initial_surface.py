@@ -24,6 +24,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident, lit_rectangle
 from caustic_cli.inverse.projection import BeamProjection, ScreenProjection, seen_by_light
 from caustic_cli.inverse.relay import RelayedScreen
+from caustic_cli.inverse.scattered import Pixels
 from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import cell_lines, cell_means, corners
@@ -151,6 +152,7 @@ class _Grid:
             directions,
             centre=centre,
             projection=projection,
+            pixels=None if projection is None else Pixels(self.target, scene.screen.half_size, projection.project, centre),
             start=potential,
             **options,
         )

@@ -139,6 +139,11 @@ class RelayedScreen:
         half, shift = self.scene.screen.half_size, self.scene.screen.shift
         return turned, (half[0] * abs(sx), half[1] * abs(sy)), (shift[0] * sx, shift[1] * sy)
 
+    def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """u of points x, y of the screen, from its centre, mm."""
+        shift = self.scene.screen.shift
+        return (x + shift[0]) * self.scale[0], (y + shift[1]) * self.scale[1]
+
     def intersections(self, origin: tuple, direction: tuple) -> tuple[np.ndarray, np.ndarray]:
         """u of rays that leave the exit, NaN where they do not reach the screen."""
         x, y = self.landing(origin, direction)

@@ -35,16 +35,18 @@ from scipy.ndimage import gaussian_filter
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.projection import ScreenProjection
 from caustic_cli.inverse.relay import RelayedScreen
-from caustic_cli.inverse.transport import Transport, corners, solve
-from caustic_cli.loading import OnDemand
+from caustic_cli.inverse.scattered import Pixels
+from caustic_cli.inverse.transport import LEVELS, Transport, corners, solve, solve_displaced
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
 
-laguerre = OnDemand("caustic_cli.optics.kernels.laguerre")
-
 Projection = ScreenProjection | RelayedScreen  # of a screen that is not the plane z_screen
-SMOOTHING = 2.0  # cells over which e is smoothed: at a kink of phi the spline smooths the slopes, which is no error of T
+#: Cells over which e is smoothed, each with its share where there is light: wide averages count where there is none nearby.
+SMOOTHING = {2.0: 1.0, 8.0: 1e-3, 32.0: 1e-6}
+KINK = 3.0  # stretch of the map, in its median, from which e is not that of T: at a kink of phi the spline smooths the slopes
 NEGLIGIBLE = 0.05  # RMS of e, pixels, that is not corrected
+#: Options of the first map onto projected pixels, which is then solved again onto these where they lie.
+ROUGHLY = {"tolerance": 1e-2, "most": 10}
 REPEATS = 4  # most fixed-point iterations; each reduces the error by a factor of about angle^2 / throw
 CONVERGED = 1e-10  # largest expected change of a height in the next iteration, mm
 ROWS = 64  # of corners processed at a time, so that intermediate arrays fit in the cache
@@ -92,6 +94,7 @@ def surface(
     corrections=2,
     centre=(0.0, 0.0),
     projection: Projection | None = None,
+    pixels: Pixels | None = None,
     **options,
 ) -> MappedSurface:
     """Surface that maps the irradiance `source` onto the picture `target` on a plane.
@@ -118,7 +121,9 @@ def surface(
     _check_place(index, z_screen, thickness)
     d = _directions(directions, (shape[0] + 1, shape[1] + 1))
     half = tuple(float(h) for h in source_half)
-    map_ = solve(source, target, half, target_half, **options)
+    first = {} if projection is None else {**ROUGHLY, "levels": LEVELS[:-1]}
+    map_ = solve(source, target, half, target_half, **{**options, **first})
+    options.pop("start", None)
     x, y = corners(shape[0], half[0])[:, None], corners(shape[1], half[1])[None, :]
     light = np.pad(np.asarray(source, dtype=np.float64), 1)
     light = light[1:, 1:] + light[:-1, 1:] + light[1:, :-1] + light[:-1, :-1]
@@ -130,12 +135,13 @@ def surface(
         landing = land(z, x, y, d, index, z_screen, projection)
         off = np.nan_to_num(np.stack([w - t for w, t in zip(landing, aim, strict=True)]))
         miss = float(np.sqrt((light * (off**2).sum(0)).sum()))
-        off = np.stack([gaussian_filter(w, SMOOTHING) for w in off])
-        if again == corrections or not np.sqrt((light * (off**2).sum(0)).sum()) > NEGLIGIBLE * min(pixel):
+        off = _smoothed(off, map_)
+        settled = not np.sqrt((light * (off**2).sum(0)).sum()) > NEGLIGIBLE * min(pixel)
+        if again == corrections or (settled and (again or not first)):
             break
         shift += off
-        moved, reach = _moved(np.asarray(target, dtype=np.float64), pixel, map_.potential, shift, x, y)
-        map_ = solve(source, moved, half, reach, start=map_.potential, **{k: v for k, v in options.items() if k != "start"})
+        sites = map_.solved.sites if again else (pixels or Pixels(np.asarray(target), target_half)).sites(source, half)
+        map_ = solve_displaced(source, sites, half, map_.potential, shift, **options)
         aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
     return MappedSurface(z, *landing, miss, shift, again, map_, time.perf_counter() - began)
 
@@ -175,23 +181,16 @@ def finer(
     return heights(map_, aim, x, y, d, index, z_screen, float(start.heights.mean()), dark, projection)
 
 
-def _moved(target, pixel, potential, shift, x, y) -> tuple[np.ndarray, tuple[float, float]]:
-    """The picture with each pixel moved by -shift at the point that illuminates it, padded as necessary, and its half sizes, mm."""
-    shape = target.shape
-    at = [(np.arange(s) + 0.5 - 0.5 * s) * w for s, w in zip(shape, pixel, strict=True)]
-    from_ = laguerre.prices(potential, at[0], np.arange(shape[0] + 1) * shape[1], np.tile(at[1], shape[0]), x[:, 0], y[0])[1]
-    bright = target.ravel() > 0
-    moves = [-s.ravel()[from_[bright]] / w for s, w in zip(shift, pixel, strict=True)]
-    frame = [min(int(np.ceil(np.abs(m).max())) + 1, s) for m, s in zip(moves, shape, strict=True)]
-    to = [i[bright] + f + np.clip(m, 1 - f, f - 1) for i, f, m in zip(np.indices(shape).reshape(2, -1), frame, moves, strict=True)]
-    low = [np.floor(t).astype(np.int64) for t in to]
-    wide = [s + 2 * f for s, f in zip(shape, frame, strict=True)]
-    out = np.zeros(wide[0] * wide[1])
-    for i in (0, 1):  # bilinear distribution over the four pixels covered
-        for j in (0, 1):
-            share = np.abs(1 - i - (to[0] - low[0])) * np.abs(1 - j - (to[1] - low[1]))
-            out += np.bincount((low[0] + i) * wide[1] + low[1] + j, share * target.ravel()[bright], len(out))
-    return out.reshape(wide), tuple(0.5 * s * w for s, w in zip(wide, pixel, strict=True))
+def _smoothed(off: np.ndarray, map_: Transport) -> np.ndarray:
+    """Displacements (2, n + 1, m + 1), mm, smoothed over cells, without those where the map stretches the light far more than on
+    average: there the spline smooths a kink, and theirs are those around."""
+    stretch = sum(np.gradient(c, axis=axis) ** 2 for c in (map_.x, map_.y) for axis in (0, 1))
+    weight = 1.0 / (1.0 + (stretch / (KINK**2 * np.median(stretch))) ** 2)
+    total, part = np.zeros_like(off), np.zeros_like(weight)
+    for width, share in SMOOTHING.items():
+        part += share * gaussian_filter(weight, width)
+        total += share * np.stack([gaussian_filter(weight * c, width) for c in off])
+    return total / part
 
 
 def _directions(directions, shape) -> tuple:

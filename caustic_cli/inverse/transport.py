@@ -47,6 +47,7 @@ FINE = 4  # raster points per source cell along each axis, over which phi is ave
 SEEN, MANY = 8, 4096  # FINE at least; beyond that, at most so many points along an axis
 #: Transport error at which sites whose cells the raster misses are merged with neighbours, for convergence; most repetitions.
 MERGED, ROUNDS = 5e-3, 4
+SCATTERED = 1e-3  # MERGED of scattered sites, whose prices are known from those of a similar map
 LEAST = 128  # raster points along an axis
 LEVELS = (64, 16, 4, 1)  # ratios of the number of sites on the finest level to that on each level
 ROUGH, WIDE = 0.5, 0.4  # resolution of the raster on which a coarse phi is smoothed, relative to the next level; width in cells
@@ -103,6 +104,38 @@ class _Sites:
     def lines(self) -> tuple:
         return self.rows, self.first, self.y2
 
+    def prices(self, phi: np.ndarray, raster: list) -> tuple[np.ndarray, np.ndarray]:
+        """As of `laguerre.prices`."""
+        return laguerre.prices(np.ascontiguousarray(phi), *self.lines, *raster)
+
+    def envelope(self, psi: np.ndarray) -> _Envelope:
+        """phi of these sites at these prices."""
+        return _Envelope(psi, self)
+
+    def without(self, seen: np.ndarray, mass: np.ndarray) -> _Sites:
+        """Those that are `seen` (N,) bool, with these masses."""
+        first = np.append(0, np.cumsum(seen))[self.first]
+        kept = np.diff(first) > 0
+        return _Sites(self.rows[kept], np.append(first[:-1][kept], first[-1]), self.y1[seen], self.y2[seen], mass)
+
+
+@dataclass(frozen=True, eq=False)
+class _Envelope:
+    """phi of sites at prices psi (N,)."""
+
+    psi: np.ndarray
+    sites: _Sites
+
+    def on(self, x1: np.ndarray, x2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As of `laguerre.envelope`."""
+        return laguerre.envelope(self.psi, *self.sites.lines, x1, x2)
+
+    def touched(self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list) -> tuple[np.ndarray, np.ndarray]:
+        """Prices at which the planes of these sites, indices (k,), touch phi, and the sites where they do, (k,) each; phi, site: as
+        `on` the raster."""
+        back, at = self.sites.prices(phi, raster)
+        return back[missing], site.ravel()[at[missing]].astype(np.int64)
+
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
@@ -137,7 +170,7 @@ def cell_lines(half: tuple[float, float], cells: int) -> tuple[np.ndarray, np.nd
 
 
 def solve(
-    source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10, darkest=DARKEST
+    source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10, darkest=DARKEST, levels=LEVELS
 ) -> Transport:
     """The optimal transport map from `source` to `target` for quadratic cost.
 
@@ -150,6 +183,7 @@ def solve(
         tolerance: error e at which Newton's method stops.
         most: Newton steps per level.
         darkest: lower bound of the source over its mean; larger values need fewer steps.
+        levels: ratios of the number of sites on the finest level to that on each, for a problem without an initial guess.
 
     Raises:
         InputError: a density that is not 2-D, not finite, negative or black, or a size that is not positive.
@@ -162,20 +196,20 @@ def solve(
         raise InputError(f"smooth must be 0.5 to 16 source cells, got {smooth!r}")
     n, m = f.shape
     f = _normalised(f, darkest, (a, b))
-    most_sites = int(n * m * f.mean() ** 2 / (f * f).mean())  # no Laguerre cells below source cells where most light is
+    most_sites = _most_sites(f, n * m)
     pyramid = _pyramid(g, (c, d), most_sites)
     psi = sites = None
     steps = 0
-    for fewer in LEVELS if start is None else LEVELS[-1:]:
+    for fewer in levels if start is None else LEVELS[-1:]:
         goal = max(most_sites // fewer, 16)
         raster = [centres(_points(s * fewer**-0.5), h) for s, h in ((n, a), (m, b))]
         old, sites = sites, _sites(pyramid, 1.0 / goal)
         linear = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)  # prices of the map that stretches the rectangle
         if start is not None:
-            psi = _prices(_resampled(start, (n, m), (a, b), raster), sites, raster)
+            psi = sites.prices(_resampled(start, (n, m), (a, b), raster), raster)[0]
         else:
             psi = linear if old is None else _refined(psi, old, sites, raster, (a, b))
-        enough = max(tolerance, MERGED) if fewer == 1 else COARSE_TOLERANCE
+        enough = max(tolerance, MERGED) if fewer == levels[-1] else COARSE_TOLERANCE
         found, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b), enough, most)
         steps += taken
         failed = error > 10.0 * enough and f.size > 1  # Newton's method, in dark regions of the source
@@ -188,15 +222,68 @@ def solve(
             steps += all_taken
             found, error = min((found, error), other, key=lambda pair: pair[1])
         psi = found
+    psi, sites, error, taken = _without_empty(psi, sites, error, taken, raster, _light(f, 0.0, raster, a, b), tolerance, most)
+    return _map(psi, sites, (n, m), (a, b), smooth, error, steps + taken, began)
+
+
+def solve_displaced(
+    source, sites: _Sites, source_half, potential, shift, *, smooth=1.5, tolerance=5e-3, most=10, darkest=DARKEST
+) -> Transport:
+    """The same onto scattered point masses, each displaced from its own place by -shift at the point of the source that a similar
+    map sends to it.
+
+    Args:
+        sites: of `scattered`, where they are in that map.
+        potential: its potential on the same source cells, (n + 1, m + 1) mm^2, and shift (2, n + 1, m + 1) mm there.
+        source, source_half, smooth, tolerance, most, darkest: as of `solve`.
+    """
+    began = time.perf_counter()
+    kernels.blocks()
+    f, (a, b) = _density("source", source), _halves("source", source_half)
+    shape = f.shape
+    f = _normalised(f, darkest, (a, b))
+    raster = [centres(max(FINE * n, LEAST), h) for n, h in zip(shape, (a, b), strict=True)]
+    phi = _resampled(potential, shape, (a, b), raster)
+    at = sites.prices(phi, raster)[1]
+    where = [x[i] for x, i in zip(raster, np.unravel_index(at, [len(x) for x in raster]), strict=True)]
+    cells = [(0.5 * x / h + 0.5) * n for x, n, h in zip(where, shape, (a, b), strict=True)]
+    moved = sites.displaced(*(-ndimage.map_coordinates(c, cells, order=1, mode="nearest") for c in shift))
+    psi, light = moved.prices(phi, raster)[0], _light(f, 0.0, raster, a, b)
+    psi, error, taken = _newton(psi, moved, raster, light, max(tolerance, SCATTERED), most)
+    psi, moved, error, more = _without_empty(psi, moved, error, taken, raster, light, tolerance, most)
+    return _map(psi, moved, shape, (a, b), smooth, error, taken + more, began)
+
+
+def _without_empty(psi, sites: _Sites, error: float, taken: int, raster: list, light: tuple, tolerance: float, most: int) -> tuple:
+    """Prices, sites, error, and steps taken: Newton's method without the sites whose cells the raster misses, after it has stopped
+    with them at `error` after `taken` steps."""
+    steps = 0
     for _ in range(ROUNDS):
         if error < tolerance or taken == 0:
             break
         psi, sites = _merged(psi, sites, raster)
-        psi, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b), tolerance, most)
+        psi, error, taken = _newton(psi, sites, raster, light, tolerance, most)
         steps += taken
-    potential, x, y = _smoothed(psi, sites, (n, m), (a, b), smooth)
-    solved = _Solved(psi, sites, (n, m), (a, b))
+    return psi, sites, error, steps
+
+
+def _map(psi, sites: _Sites, shape, half, smooth: float, error: float, steps: int, began: float) -> Transport:
+    potential, x, y = _smoothed(psi, sites, shape, half, smooth)
+    solved = _Solved(psi, sites, shape, half)
     return Transport(potential - potential.mean(), x, y, error, len(psi), steps, time.perf_counter() - began, solved)
+
+
+def point_masses(source, picture, half, darkest=DARKEST) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The point masses of the finest level for a picture (k, l) with half sizes in mm: y1, y2 mm and masses, (N,) each."""
+    f, half = _density("source", source), _halves("target", half)
+    most = _most_sites(_normalised(f, darkest, (1.0, 1.0)), f.size)
+    sites = _sites(_pyramid(_density("target", picture), half, most), 1.0 / max(most, 16))
+    return sites.y1, sites.y2, sites.mass
+
+
+def _most_sites(f: np.ndarray, cells: int) -> int:
+    """No Laguerre cells below source cells where most light is."""
+    return int(cells * f.mean() ** 2 / (f * f).mean())
 
 
 def _normalised(f: np.ndarray, darkest: float, half: tuple[float, float]) -> np.ndarray:
@@ -211,7 +298,8 @@ def _continued(psi: np.ndarray, sites: _Sites, raster, f: np.ndarray, half: tupl
     for the source and in all."""
     steps = 0
     for even in EVENER:
-        psi, error, taken = _newton(psi, sites, raster, _light(f, even, raster, *half), COARSE_TOLERANCE if even else enough, most)
+        tolerance = COARSE_TOLERANCE if even else enough
+        psi, error, taken = _newton(psi, sites, raster, _light(f, even, raster, *half), tolerance, most)
         steps += taken
     return psi, error, taken, steps
 
@@ -219,7 +307,7 @@ def _continued(psi: np.ndarray, sites: _Sites, raster, f: np.ndarray, half: tupl
 def _refined(psi: np.ndarray, coarser: _Sites, sites: _Sites, raster: list[np.ndarray], half: tuple[float, float]) -> np.ndarray:
     """Prices of the sites of a level, from those of the coarser one."""
     coarse = [centres(int(ROUGH * len(x)), h) for x, h in zip(raster, half, strict=True)]
-    return _prices(_rounded(psi, coarser, coarse, half), sites, coarse)
+    return sites.prices(_rounded(psi, coarser, coarse, half), coarse)[0]
 
 
 def _points(cells: float) -> int:
@@ -318,10 +406,6 @@ def _sites(pyramid: list, least: float) -> _Sites:
     return _Sites(at, np.append(first, len(row)), np.repeat(at, np.diff(np.append(first, len(row)))), y2, mass / mass.sum())
 
 
-def _prices(phi: np.ndarray, sites: _Sites, raster: list) -> np.ndarray:
-    return laguerre.prices(np.ascontiguousarray(phi), *sites.lines, *raster)[0]
-
-
 def _resampled(potential, shape: tuple[int, int], half: tuple[float, float], raster: list) -> np.ndarray:
     """The initial potential, interpolated on the raster; InputError if it is invalid."""
     v = np.asarray(potential, dtype=np.float64)
@@ -337,34 +421,32 @@ def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, fl
     width = [WIDE * s / len(psi) ** 0.5 for s in shape]
     pad = [int(np.ceil(3.0 * w)) for w in width]
     wide = [centres(s, h, p) for s, h, p in zip(shape, half, pad, strict=True)]
-    phi, _ = laguerre.envelope(psi, *sites.lines, *wide)
+    phi, _ = sites.envelope(psi).on(*wide)
     phi = ndimage.gaussian_filter(phi, width, mode="nearest", truncate=3.0)
     return phi[pad[0] : -pad[0], pad[1] : -pad[1]]
 
 
 def _merged(psi: np.ndarray, sites: _Sites, raster: list) -> tuple[np.ndarray, _Sites]:
     """Prices and sites without those whose cells contain no raster point; their mass is added to the nearest ones."""
-    _, site = laguerre.envelope(psi, *sites.lines, *raster)
+    _, site = sites.envelope(psi).on(*raster)
     seen = np.zeros(len(psi), bool)
     seen[site.ravel()] = True
     at = np.column_stack([sites.y1, sites.y2])
     _, nearest = cKDTree(at[seen]).query(at[~seen])
     mass = sites.mass[seen] + np.bincount(nearest, sites.mass[~seen], np.count_nonzero(seen))
-    first = np.append(0, np.cumsum(seen))[sites.first]
-    kept = np.diff(first) > 0
-    return psi[seen], _Sites(sites.rows[kept], np.append(first[:-1][kept], first[-1]), sites.y1[seen], sites.y2[seen], mass)
+    return psi[seen], sites.without(seen, mass)
 
 
 def _cells(psi: np.ndarray, sites: _Sites, raster: list, light: tuple) -> tuple:
     """Prices (those of empty cells lowered until they touch phi), masses of the cells, and the sparse Jacobian as a graph."""
-    phi, site = laguerre.envelope(psi, *sites.lines, *raster)
+    envelope = sites.envelope(psi)
+    phi, site = envelope.on(*raster)
     seen = np.zeros(len(psi), bool)
     seen[site.ravel()] = True
     missing, touched, bond = np.flatnonzero(~seen), np.zeros(0, np.int64), np.zeros(0)
     if len(missing):
-        back, at = laguerre.prices(phi, *sites.lines, *raster)
-        psi = np.where(seen, psi, back)
-        touched = site.ravel()[at[missing]].astype(np.int64)
+        psi = psi.copy()
+        psi[missing], touched = envelope.touched(missing, phi, site, raster)
         distance = np.hypot(sites.y1[missing] - sites.y1[touched], sites.y2[missing] - sites.y2[touched])
         bond = BOND * np.sqrt(sites.mass[missing] * light[0].mean()) / distance
     net = laguerre.borders(site, len(psi))
@@ -406,9 +488,10 @@ def _smoothed(psi, sites: _Sites, shape, half, smooth: float) -> np.ndarray:
     pad = FINE * int(np.ceil(len(kernel) / (2 * FINE)))
     x1, x2 = (centres(FINE * s, h, pad) for s, h in zip(shape, half, strict=True))
     m, low, out = shape[1], pad - len(kernel) // 2, np.empty((3, shape[0] + 1, shape[1] + 1))
+    envelope = sites.envelope(psi)
     for j in range(0, m + 1, STRIP):
         count = min(STRIP, m + 1 - j)
         at = low + FINE * j
-        phi, site = laguerre.envelope(psi, *sites.lines, x1, x2[at : at + FINE * (count - 1) + len(kernel)])
+        phi, site = envelope.on(x1, x2[at : at + FINE * (count - 1) + len(kernel)])
         laguerre.averages(phi, site, sites.y1, sites.y2, kernel, FINE, low, out[:, :, j : j + count])
     return out

@@ -126,6 +126,39 @@ def _prices(i, across, phi, rows, first, y2, x1, x2, part, which, psi, at):
         part[j, i], which[j, i] = -value[j], place[j]
 
 
+def walked(y1, y2, psi, first, other, begin, x1, x2):
+    """phi and site on a raster, as of `envelope`, of sites anywhere, by walks from neighbour to neighbour.
+
+    Args:
+        y1, y2, psi: (N,) coordinates and prices; the neighbours of p are other[first[p]..first[p + 1]].
+        begin: a site that has neighbours.
+    """
+    phi, site = np.empty((len(x1), len(x2))), np.empty((len(x1), len(x2)), np.int32)
+    _walked(ALL, y1, y2, psi, first, other, begin, x1, x2, phi, site)
+    return phi, site
+
+
+@njit(entry=True, nogil=True)
+def _walked(i, y1, y2, psi, first, other, begin, x1, x2, phi, site):
+    """Row i of `walked`."""
+    if i == ALL:
+        on_threads(len(x1), (y1, y2, psi, first, other, begin, x1, x2, phi, site))
+        return
+    p = begin
+    for j in range(len(x2)):
+        best, there = x1[i] * y1[p] + x2[j] * y2[p] - psi[p], p
+        while True:
+            for e in range(first[p], first[p + 1]):
+                q = other[e]
+                value = x1[i] * y1[q] + x2[j] * y2[q] - psi[q]
+                if value > best:
+                    best, there = value, q
+            if there == p:
+                break
+            p = there
+        phi[i, j], site[i, j] = best, p
+
+
 def averages(phi, site, y1, y2, weights, step, low, out) -> None:
     """Weighted averages of phi and its gradient over squares of a raster, at every `step`-th of its points.
 
