@@ -47,7 +47,8 @@ FINE = 4  # raster points per source cell along each axis, over which phi is ave
 SEEN, MANY = 8, 4096  # FINE at least; beyond that, at most so many points along an axis
 #: Transport error at which sites whose cells the raster misses are merged with neighbours, for convergence; most repetitions.
 MERGED, ROUNDS = 5e-3, 4
-SCATTERED = 1e-3  # MERGED of scattered sites, whose prices are known from those of a similar map
+SCATTERED, NEARBY = 2e-3, 16  # MERGED of scattered sites, many of them at the edge of the light, and with how many neighbours
+COVERED = 0.99  # part of the scattered sites that move by no more than the map is widened for its first prices
 LEAST = 128  # raster points along an axis
 LEVELS = (64, 16, 4, 1)  # ratios of the number of sites on the finest level to that on each level
 ROUGH, WIDE = 0.5, 0.4  # resolution of the raster on which a coarse phi is smoothed, relative to the next level; width in cells
@@ -248,20 +249,24 @@ def solve_displaced(
     where = [x[i] for x, i in zip(raster, np.unravel_index(at, [len(x) for x in raster]), strict=True)]
     cells = [(0.5 * x / h + 0.5) * n for x, n, h in zip(where, shape, (a, b), strict=True)]
     moved = sites.displaced(*(-ndimage.map_coordinates(c, cells, order=1, mode="nearest") for c in shift))
+    spread = [np.quantile(np.abs(d), COVERED) / h for d, h in zip((moved.y1 - sites.y1, moved.y2 - sites.y2), (a, b), strict=True)]
+    phi = phi + 0.5 * (spread[0] * raster[0][:, None] ** 2 + spread[1] * raster[1] ** 2)  # whose map reaches the outermost sites
     psi, light = moved.prices(phi, raster)[0], _light(f, 0.0, raster, a, b)
     psi, error, taken = _newton(psi, moved, raster, light, max(tolerance, SCATTERED), most)
-    psi, moved, error, more = _without_empty(psi, moved, error, taken, raster, light, tolerance, most)
+    psi, moved, error, more = _without_empty(psi, moved, error, taken, raster, light, tolerance, most, NEARBY)
     return _map(psi, moved, shape, (a, b), smooth, error, taken + more, began)
 
 
-def _without_empty(psi, sites: _Sites, error: float, taken: int, raster: list, light: tuple, tolerance: float, most: int) -> tuple:
+def _without_empty(
+    psi, sites: _Sites, error: float, taken: int, raster: list, light: tuple, tolerance: float, most: int, nearby: int = 1
+) -> tuple:
     """Prices, sites, error, and steps taken: Newton's method without the sites whose cells the raster misses, after it has stopped
-    with them at `error` after `taken` steps."""
+    with them at `error` after `taken` steps; nearby: see `_merged`."""
     steps = 0
     for _ in range(ROUNDS):
         if error < tolerance or taken == 0:
             break
-        psi, sites = _merged(psi, sites, raster)
+        psi, sites = _merged(psi, sites, raster, nearby)
         psi, error, taken = _newton(psi, sites, raster, light, tolerance, most)
         steps += taken
     return psi, sites, error, steps
@@ -426,14 +431,16 @@ def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, fl
     return phi[pad[0] : -pad[0], pad[1] : -pad[1]]
 
 
-def _merged(psi: np.ndarray, sites: _Sites, raster: list) -> tuple[np.ndarray, _Sites]:
-    """Prices and sites without those whose cells contain no raster point; their mass is added to the nearest ones."""
+def _merged(psi: np.ndarray, sites: _Sites, raster: list, nearby: int = 1) -> tuple[np.ndarray, _Sites]:
+    """Prices and sites without those whose cells contain no raster point; their mass is added to so many of the nearest ones."""
     _, site = sites.envelope(psi).on(*raster)
     seen = np.zeros(len(psi), bool)
     seen[site.ravel()] = True
     at = np.column_stack([sites.y1, sites.y2])
-    _, nearest = cKDTree(at[seen]).query(at[~seen])
-    mass = sites.mass[seen] + np.bincount(nearest, sites.mass[~seen], np.count_nonzero(seen))
+    left = np.count_nonzero(seen)
+    nearby = min(nearby, left)
+    nearest = cKDTree(at[seen]).query(at[~seen], nearby)[1]
+    mass = sites.mass[seen] + np.bincount(nearest.ravel(), np.repeat(sites.mass[~seen] / nearby, nearby), left)
     return psi[seen], sites.without(seen, mass)
 
 
