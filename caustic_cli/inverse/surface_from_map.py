@@ -12,8 +12,8 @@ analytically; only the remaining slopes are integrated, in the least-squares sen
 Strang, SIAM Review 41, 1999).  Since t depends on z, this is a fixed-point iteration at constant mean height.
 
 The required slopes are not exactly integrable.  The residual displaces the landing points by e(x, y), a smooth field that grows
-with the angles.  It is corrected by an outer iteration: each pixel of the picture is moved by -e at the point that illuminates it,
-the transport is solved again, and rays are aimed at T + e.
+with the angles.  It is corrected by an outer iteration: each point mass of the picture is moved by -e at the point that illuminates
+it, the transport is solved again (`scattered`), and rays are aimed at T + e.
 
 For a tilted or curved screen T and e are points of the plane z_screen in central projection (`projection`); rays are aimed at the
 point of the screen that projects to T, and landing points are projected back.
