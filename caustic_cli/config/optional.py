@@ -64,7 +64,7 @@ def complete_sunlight(source: SourceSettings, room: RoomSettings | None, array: 
     type = sources.type_of(source.type)
     if "tilt" not in type.keys:
         raise InputError(
-            f"⟨room.place⟩ needs ⟨source⟩ {alternatives(sources.used_by('tilt'))}, light from infinity, got {type.name}"
+            f"⟨room.place⟩ needs ⟨source⟩ {alternatives(sources.used_by('tilt'))}, whose light has a direction, got {type.name}"
         )
     light, _ = sunlight(room)
     times = sunlights.instants(room.time, math.prod(array))
@@ -114,7 +114,7 @@ def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping
     """
     interaction, source = interaction_of(s.lens.mirror), build_source(s.source)
     if by.screen_place is None:
-        if not source.oblique:
+        if not source.lean:
             return s.screen
         x, y, z = (abs(s.screen.z) / source.axis[2] * c for c in source.axis)
         return s.screen.filled(tilt=[interaction.side * angle + 0.0 for angle in source.tilt], shift=[x + 0.0, y + 0.0])

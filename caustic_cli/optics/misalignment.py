@@ -122,11 +122,10 @@ class Misalignment:
             across, along = (d / (2.0 * r) for d, r in zip(aside, scene.pupil.half_size, strict=True))
             return replace(cast(Any, source), profile=displaced(source.profile, (across, along)))
         if isinstance(source, Measured):
-            turn = np.array(self.lens_pose(scene).axes)
-            rays = source.rays
+            rays = source.turned
             if any(self.lens_tilt):
-                rays = replace(rays, positions=rays.positions @ turn.T, directions=rays.directions @ turn.T)
-            return replace(source, rays=rays, position=moved(source.position))
+                rays = rays.turned(np.array(self.lens_pose(scene).axes).T)
+            return replace(source, rays=rays, position=moved(source.origin.tolist()), tilt=(0.0, 0.0))
         return source.displaced(moved, scale, rotate_to_local(self.lens_pose(scene), source.axis))
 
     def upright(self, scene: Scene) -> Scene:
