@@ -171,14 +171,36 @@ def reflecting(scene):
     return replace(scene, lens=replace(scene.lens, mirror=True), screen=replace(scene.screen, z=-300.0, size=(60.0, 50.0)))
 
 
+def oblique(source, mirror=False):
+    """A change of the scene to light at an angle, and to a screen square to it or to the light that a mirror reflects."""
+
+    def changed(scene):
+        scene = reflecting(scene) if mirror else scene
+        side, (x, y, z) = scene.lens.interaction.side, (300.0 * c for c in source.axis)
+        screen = replace(scene.screen, z=side * z, tilt=tuple(side * angle for angle in source.tilt), shift=(x, y))
+        return replace(scene, source=source, screen=screen)
+
+    return changed
+
+
+OBLIQUE = {
+    "20 degrees": oblique(PlaneWave(tilt=(20.0, 0.0))),
+    "40 degrees": oblique(PlaneWave(tilt=(-30.0, 28.0))),
+    "60 degrees": oblique(PlaneWave(tilt=(0.0, 60.0))),
+    "sun": oblique(Disc(angle=0.5333, tilt=(0.0, -40.0))),
+    "mirror at 45 degrees": oblique(PlaneWave(tilt=(0.0, 45.0)), mirror=True),
+}
+
+
 def dispersing(scene):
     light = Light(wavelengths=(450.0, 550.0, 650.0), weights=(1.0, 2.0, 1.0))
     return replace(scene, lens=replace(scene.lens, glass="N-SF11", index=1.78), light=light)
 
 
-@pytest.mark.parametrize("how", [leaning, reflecting, dispersing, lambda scene: leaning(dispersing(scene))])
+@pytest.mark.parametrize("how", [leaning, reflecting, dispersing, lambda scene: leaning(dispersing(scene)), *OBLIQUE.values()])
 def test_scenes_are_written_and_compared_as_they_are(how, tmp_path, monkeypatch):
-    """Tilted and shifted screens, mirrors and several wavelengths, by a trace in place of Mitsuba's; a lens that leans differs."""
+    """Tilted and shifted screens, mirrors, several wavelengths and light at an angle, by a trace in place of Mitsuba's; a lens that
+    leans differs."""
     scene, field, heights = scene_with(PlaneWave())
     scene = how(scene)
     monkeypatch.setattr(verify, "find_spec", lambda name: True)
@@ -237,14 +259,18 @@ def mitsuba():
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("source", SOURCES, ids=NAMES)
+@pytest.mark.parametrize("source", [*SOURCES, *OBLIQUE.values()], ids=[*NAMES, *OBLIQUE])
 def test_mitsuba_agrees(mitsuba, tmp_path, source, capsys):
-    scene, field, heights = scene_with(source)
+    if callable(source):
+        scene, field, heights = scene_with(PlaneWave())
+        scene = source(scene)
+    else:
+        scene, field, heights = scene_with(source)
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (129, 129), dark=True)
     decision = verify.verify([tmp_path / "lens.xml"], scene, field, heights, RAYS // 2)
     with capsys.disabled():
         print(
-            f"\n  {source.kind if hasattr(source, 'kind') else 'plane'}: mean Z^2 {decision.figures['z_mean_square']:.3f},"
+            f"\n  {scene.source.label}: mean Z^2 {decision.figures['z_mean_square']:.3f},"
             f" light {decision.figures['on_screen']:.5f} and {decision.figures['on_screen_render']:.5f}",
             end="",
         )
