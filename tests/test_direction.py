@@ -468,9 +468,9 @@ def test_nonsense_is_refused_in_a_line(in_tmp, capfd, options, words):
 def test_what_has_no_tilted_light_says_so(in_tmp, capfd):
     write_blob()
     assert design("--source-tilt", "20,0", "--quiet") == 0
-    for command in (["export", "p", "--format", "mitsuba", "-o", "scene.xml"], ["render", "p", "--html", "p.html"]):
-        assert cli.run(command) == 2
-        assert "tilted" in capfd.readouterr().err.splitlines()[-1]
+    assert cli.run(["render", "p", "--html", "p.html"]) == 2
+    assert "tilted" in capfd.readouterr().err.splitlines()[-1]
+    assert cli.run(["export", "p", "--format", "mitsuba", "-o", "scene.xml"]) == 0
     assert cli.run(["export", "p", "--format", "stl", "-o", "p.stl"]) == 0
 
 

@@ -28,11 +28,10 @@ _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     "lighttools": {"user-defined source": SOURCE},
     "mitsuba": {
         **dict.fromkeys(
-            [name for name in BEYOND_CLEAR if name not in ("mirror", "gradient index", "shifted screen")],
-            "⟨format⟩ mitsuba is written for clear lenses and straight screens, not {}",
+            [name for name in BEYOND_CLEAR if name not in ("mirror", "gradient index", "tilted screen", "shifted screen")],
+            "⟨format⟩ mitsuba is written for clear lenses and plane screens, not {}",
         ),
         **dict.fromkeys(("ray file", "several sources", "user-defined source"), SOURCE),
-        "tilted light": "⟨format⟩ mitsuba: its collimated emitter is along the axis, so tilted light cannot be written",
         "uneven plane wave": "⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written",
         **dict.fromkeys(
             ("disc at infinity", "disc not Lambertian", "disc in a cone"),
