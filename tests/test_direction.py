@@ -468,9 +468,13 @@ def test_nonsense_is_refused_in_a_line(in_tmp, capfd, options, words):
 def test_what_has_no_tilted_light_says_so(in_tmp, capfd):
     write_blob()
     assert design("--source-tilt", "20,0", "--quiet") == 0
-    assert cli.run(["render", "p", "--html", "p.html"]) == 2
-    assert "tilted" in capfd.readouterr().err.splitlines()[-1]
+    assert cli.run(["export", "p", "--format", "lighttools", "--script", "-o", "p.npz"]) == 2
+    assert "--script" in capfd.readouterr().err.splitlines()[-1]
     assert cli.run(["export", "p", "--format", "mitsuba", "-o", "scene.xml"]) == 0
+    assert cli.run(["export", "p", "--format", "zemax", "-o", "p.dat"]) == 0
+    head = (in_tmp / "p.dat").read_text().split("\n", 8)
+    assert any("light along (0, -0.342" in line for line in head)
+    assert any("tilted about the fixed x axis by 20 degrees" in line for line in head)
     assert cli.run(["export", "p", "--format", "stl", "-o", "p.stl"]) == 0
 
 

@@ -60,6 +60,8 @@ SCRIPT = Capability(
         **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
         **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
         "gradient index": SHAPE,
+        "tilted light": "⟨script⟩: its source shines along the axis, so light at an angle, which the archive alone holds, cannot be"
+        " written",
         "lumens": "⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written",
         "uneven plane wave": "⟨script⟩: its source is uniform, so one with a profile cannot be written",
         **dict.fromkeys(
