@@ -29,7 +29,8 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose, tracers
 from caustic_cli.optics.waves.image import wave_image
-from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene import Component, Disc, FoldMirror, FreeForm, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.screen import tilt_to, tilted
 from caustic_cli.studies.gradmap import finite_difference, gradient_image
 from caustic_cli.studies.independent_rays import sample_rays
@@ -217,6 +218,32 @@ def test_a_tilted_wave_is_a_wave_with_a_tilted_direction():
     assert float(off) < 1e-9
     assert float(other.sum()) == pytest.approx(float(image.sum()), rel=3e-3)
     assert float((other - image).norm()) < 0.02 * float(image.norm())
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        {"lens": {"gradient": Gradient("axial", (0.02,))}},
+        {"lens": {"gradient": Gradient("radial", (-0.002,))}},
+        {"lens": {"entrance": FreeForm(0.02 * np.random.default_rng(0).standard_normal((8, 8)), (3, 3))}},
+        {"elements": (Component(30.0, (40.0, 40.0), radius=(60.0, 60.0), thickness=4.0, index=1.5),)},
+        {"elements": (FoldMirror(50.0, (60.0, 60.0), tilt=(45.0, 0.0)),)},
+    ],
+    ids=["axial gradient", "radial gradient", "two sides", "another lens", "fold mirror"],
+)
+def test_light_at_an_angle_through_whatever_else_a_scene_has(beside):
+    """It is that of a point far away, which is traced as light of a near source is."""
+    lens = replace(scene((0.0, 0.0), z_in=0.0, offset=Offset(5.0)).lens, **beside.get("lens", {}))
+    plain = Scene(PlaneWave(), lens, Screen((40.0, 40.0), 100.0, (20, 20)), elements=beside.get("elements", ()))
+    field, z, images = HeightField.of(lens), 1.0 + heights(), []
+    wave = PlaneWave(tilt=(8.0, -5.0))
+    for source in (wave, Points((tuple(-1e6 * c for c in wave.axis),))):
+        lit = replace(plain, source=source)
+        found = expose(lit, field, z, rays_of(lit, "stratified", 400_000))
+        assert float(found.image.sum()) + sum(found.lost.values()) == pytest.approx(1.0, abs=1e-12)
+        images.append(found.image.numpy() / (1.0 - found.lost["missed_lens"]))
+    assert images[0].sum() == pytest.approx(images[1].sum(), rel=1e-3) and images[0].sum() > 0.3
+    assert relative_rms(*images) < 0.03
 
 
 @pytest.mark.parametrize(("tilt", "mirror"), [((0.0, 40.0), False), ((-50.0, 20.0), False), ((0.0, 45.0), True)])
