@@ -281,15 +281,21 @@ def mitsuba():
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("source", [*SOURCES, *OBLIQUE.values()], ids=[*NAMES, *OBLIQUE])
+@pytest.mark.parametrize(
+    "source",
+    [*SOURCES, *OBLIQUE.values(), leaning, reflecting, lambda scene: leaning(dispersing(scene))],
+    ids=[*NAMES, *OBLIQUE, "leaning screen", "mirror", "three wavelengths"],
+)
 def test_mitsuba_agrees(mitsuba, tmp_path, source, capsys):
     if callable(source):
         scene, field, heights = scene_with(PlaneWave())
         scene = source(scene)
     else:
         scene, field, heights = scene_with(source)
-    write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (129, 129), dark=True)
-    decision = verify.verify([tmp_path / "lens.xml"], scene, field, heights, RAYS // 2)
+    paths = [tmp_path / f"{k}.xml" for k in range(len(scene.bands))]
+    for path, band in zip(paths, scene.bands, strict=True):
+        write_mitsuba(path, band.scene, field, heights, (129, 129), dark=True)
+    decision = verify.verify(paths, scene, field, heights, RAYS // 2)
     with capsys.disabled():
         print(
             f"\n  {scene.source.label}: mean Z^2 {decision.figures['z_mean_square']:.3f},"

@@ -102,9 +102,7 @@ class DayOfSunlight(Output):
         assert room is not None
         times, targets = instants(room.time, len(scene.by_source)), project.targets(scene)
         if not len(times) == len(targets) == len(scene.by_source):
-            raise InputError(
-                "⟨day⟩ of sources that shine in turn needs ⟨room.time⟩ as an interval and a picture for each of them"
-            )
+            raise InputError("⟨day⟩ of sources that shine in turn needs ⟨room.time⟩ as an interval and a picture for each of them")
         followers = [follower(*pair) for pair in zip(scene.by_source, targets, strict=True)]
         return study.SundialFollower(followers, in_reading_order(times, scene.lens.array))
 
