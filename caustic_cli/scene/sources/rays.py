@@ -103,6 +103,10 @@ class Measured(Source):
         """As of a source, from the point of closest approach."""
         return 2.0 * math.degrees(math.atan2(self._width() / 2.0, abs(z_in - self.centre[2])))
 
+    def cone_over(self, pupil: Pupil) -> float:
+        """As of a source, about +z: what covers the pupil from the point of closest approach."""
+        return self._covering(pupil)
+
     def incidence(self, pupil: Pupil) -> float:
         """As of a source: the largest angle among the rays themselves."""
         d = self.turned.directions[self.crossing(pupil)[2]]
