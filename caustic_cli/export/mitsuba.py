@@ -117,7 +117,7 @@ def _lens_files(scene: Scene) -> list[str]:
 
 def _lens(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]) -> list[str]:
     """The scene of a lens with these free-form sides, after writing its meshes."""
-    lens, screen, (*fronts, surface) = scene.lens, scene.screen, sides
+    lens, (*fronts, surface) = scene.lens, sides
     glass, onto, flat = _glass(lens.index), _onto(scene), _FLATS[lens.aperture]
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     rim = points[rim_of(*surface.points.shape[:2])]
@@ -128,9 +128,9 @@ def _lens(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]) 
         low, entrance = rim * [1.0, 1.0, 0.0] + [0.0, 0.0, lens.z_in], _flat_entrance(lens, flat.shape, glass)
     write_mesh(_beside(path, "exit"), points, triangles(surface.points), normals)
     write_mesh(_beside(path, "sides"), *_strip(rim, low))
-    away = 0.9 * (screen.z - max(float(points[:, 2].max()), *(e.extent[1] for e in scene.behind), -math.inf))
+    before = max(float(points[:, 2].max()), *(e.extent[1] for e in scene.behind), -math.inf)
     return [
-        *_camera(scene, away, onto, len(System.of(scene).elements) + 2),
+        *_camera(scene, before, onto, len(System.of(scene).elements) + 2),
         *entrance,
         f'<shape type="ply" id="exit">{_file(path, "exit")}{glass}</shape>',
         f'<shape type="ply" id="sides">{_file(path, "sides")}<boolean name="face_normals" value="true"/>{BLACK}</shape>',
@@ -210,14 +210,14 @@ def _mirror(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]
     Raises:
         InputError: something obstructs the light of a near source.
     """
-    screen, lens, surface = scene.screen, scene.lens, sides[-1]
+    lens, surface = scene.lens, sides[-1]
     if not scene.source.collimated:
         refuse_obstructed(scene, designed=True)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     write_mesh(_beside(path, "mirror"), points, triangles(surface.points)[:, ::-1], -normals)  # towards the light
-    away = 0.9 * (min(float(points[:, 2].min()), lens.z_in) - BEFORE - screen.z)
+    before = min(float(points[:, 2].min()), lens.z_in) - BEFORE
     return [
-        *_camera(scene, away),
+        *_camera(scene, before),
         f'<shape type="ply" id="mirror">{_file(path, "mirror")}{MIRRORED}</shape>',
         *_screen(scene),
         *(line.replace("</shape>", '<bsdf type="null"/></shape>') for line in light),
@@ -238,10 +238,11 @@ def _facing(scene: Scene) -> bool:
     return sum(map(mul, scene.undeviated, scene.screen.axes[2])) > 0
 
 
-def _camera(scene: Scene, away: float, onto: str = "", depth: int = DEPTH) -> list[str]:
-    """First lines of the scene: integrator, and a camera `away` mm from the screen on its normal, on the side of the light, whose
-    image the screen fills; onto: transformation to a folded axis."""
-    screen, (sx, sy) = scene.screen, scene.screen.half_size
+def _camera(scene: Scene, before: float, onto: str = "", depth: int = DEPTH) -> list[str]:
+    """First lines of the scene: integrator, and a camera on the normal of the screen, on the side of the light, whose image the
+    screen fills; before: z of the axis from which its plane is away; onto: transformation to a folded axis."""
+    screen, (sx, sy), (x, y, z) = scene.screen, scene.screen.half_size, scene.screen.centre
+    away = 0.9 * abs(sum(map(mul, (x, y, z - before), screen.axes[2])))
     seen = f'<scale x="-1"/><translate z="{real(-away)}"/>'
     if not _facing(scene):
         seen = f'<rotate y="1" angle="180"/><translate z="{real(away)}"/>'
