@@ -87,6 +87,7 @@ def test_a_day(in_tmp, capfd, monkeypatch):
         assert row["moved"] == pytest.approx((0.0, 0.0), abs=1.0) and row["brightness"] == pytest.approx(1.0, abs=0.02)
         assert row["on_screen"] > 0.95 and row["error"] == pytest.approx(row["followed_error"], abs=0.05)
     before, after = rows["13:30"], rows["14:00"]  # the light of the hour before goes on as that of the next one comes
+    assert max(row["on_screen"] for row in (before, after)) < 0.3
     assert before["moved"][0] * after["moved"][0] < 0 and min(abs(row["moved"][0]) for row in (before, after)) > 30.0
 
 

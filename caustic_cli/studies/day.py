@@ -13,7 +13,8 @@ Notation
                 or as designed
     on screen   legible, and at least PART of the power of the followed picture still lands on the screen where it stands
 
-Of a sundial the picture is at each time that of the nearest of its hours, with F_0, P_0 and C of its own.
+Of a sundial the picture is at each time that of the nearest of its hours, with F_0, P_0 and C of its own; it is on the screen as
+far as its target is, displaced as it is.
 
 Powers are those of a beam of constant irradiance across it, of which the pane receives the cosine of its incidence: air, which
 weakens a low sun, is not in them.  Stray light is left out: ghosts, and what meets a surface twice.
@@ -197,6 +198,13 @@ class Follower:
         )
         return Looked(instant, image * cosine, around * cosine)
 
+    def kept(self, moved: tuple[float, float]) -> float:
+        """Part of the target that is on the screen where it stands after a displacement along the screen's axes, mm."""
+        light = self.target.sum(0) if self.target.ndim == 3 else self.target
+        pixels = [round(d / w) for d, w in zip(moved, self.scene.screen.pixel, strict=True)]
+        i, j = (slice(max(0, -k), max(0, n - max(0, k))) for k, n in zip(pixels, light.shape, strict=True))
+        return float(light[i, j].sum() / light.sum())
+
     def _where_it_stands(self, scene: Scene, landing: Landing) -> tuple[np.ndarray, list[Image] | None]:
         """Image around the screen where it stands, and halves of that on it; black and None where no light comes near it."""
         pixels = tuple(n * (AROUND - 1) // 2 for n in scene.screen.resolution)
@@ -270,8 +278,10 @@ class SundialFollower:
         return as_designed, legible
 
     def at(self, time: datetime) -> Looked:
-        """As of a follower."""
-        return self.of(time).at(time)
+        """As of a follower; other pictures are not counted as parts of this one on the screen where it stands."""
+        follower = self.of(time)
+        seen = follower.at(time)
+        return replace(seen, instant=replace(seen.instant, on_screen=follower.kept(seen.instant.moved)))
 
 
 def _minutes(time: datetime) -> float:
