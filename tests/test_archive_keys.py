@@ -40,7 +40,7 @@ SCENES = {
     "sun": replace(PLAIN, source=Disc(angle=0.5, brightness=np.ones((3, 5)))),
     "grid": replace(PLAIN, source=Points(((0.0, 0.0, -30.0), (1.0, 0.0, -30.0)), kind="grid", intensity=TABLE)),
     "disc": replace(PLAIN, source=Disc(), light=Light(wavelengths=(500.0, 600.0), measure=LED, efficacy=300.0)),
-    "rays": replace(PLAIN, source=RAYS),
+    "rays": replace(PLAIN, source=replace(RAYS, tilt=(20.0, 0.0))),
     "several": replace(PLAIN, source=Several((PlaneWave(), Points(((0.0, 0.0, -20.0),)), RAYS), (((), ()),) * 3)),
     "colour": replace(PLAIN, light=Light(wavelengths=(611.0, 549.0, 464.0), weights=(1.0, 2.0, 1.0), color=True)),
     "lens": replace(

@@ -101,6 +101,7 @@ SCENES: dict[str, Scene] = {
     "shifted screen": screen(shift=(3.0, 0.0)),
     "curved screen": screen(sags=Sags(np.zeros((4, 4)), PLAIN.screen.size)),
     "several sources": of(Several((PlaneWave(), PlaneWave(2.0)), (NONE, NONE))),
+    "sources at once": of(Several((PlaneWave(), PlaneWave(2.0)), (NONE, NONE))),
     "ray file": of(FILE),
     "ray file among sources": of(Several((PlaneWave(), FILE), (NONE, NONE))),
     "user-defined source": of(Ring((AT,), kind="ring")),

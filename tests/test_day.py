@@ -119,7 +119,8 @@ def test_periods():
     """Times are as designed, legible, and legible on the screen by their own bounds; each period ends where one is not."""
 
     def at(minute: int, followed: float, on_screen: float, brightness: float = 1.0) -> Instant:
-        return Instant(NOON + timedelta(minutes=minute), 180.0, 20.0, 20.0, None, followed, (0.0, 0.0), brightness, on_screen)
+        time, sun = NOON + timedelta(minutes=minute), (180.0, 20.0, 20.0)
+        return Instant(time, *sun, None, followed, (0.0, 0.0), (0.2, 0.5), brightness, on_screen)
 
     rows = [(0, 0.9, 1.0), (1, 0.4, 0.2), (2, 0.1, 1.0), (3, 0.4, 1.0), (4, 0.6, 1.0), (5, 0.1, 0.6), (6, 0.1, 1.0, 0.05)]
     day = Day(0.1, (0.2, 0.5), tuple(at(*row) for row in rows))

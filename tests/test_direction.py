@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 from helpers import write_blob
+from scipy.interpolate import NdBSpline
 from scipy.ndimage import gaussian_filter
 
 from caustic_cli import cli
+from caustic_cli.config import settings
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.inverse.initial_surface import first_surface
@@ -27,7 +29,8 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose, tracers
 from caustic_cli.optics.waves.image import wave_image
-from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene import Component, Disc, FoldMirror, FreeForm, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.screen import tilt_to, tilted
 from caustic_cli.studies.gradmap import finite_difference, gradient_image
 from caustic_cli.studies.independent_rays import sample_rays
@@ -140,6 +143,69 @@ def test_gradient_on_a_mirror_is_that_of_differences():
     assert float(slope[at]) == pytest.approx(float(((by_kernel[0] - by_kernel[1]) * pull).sum()) / (2.0 * STEP), rel=1e-5)
 
 
+def traced(lit: Scene, z: torch.Tensor, rays: int) -> tuple[np.ndarray, np.ndarray]:
+    """Image and sums of squares of the powers of random rays: Snell's law in vectors, Newton's method on SciPy's spline, the law of
+    reflection and the plane of the screen, in NumPy alone."""
+    lens, d, rng = lit.lens, np.array(lit.source.axis), np.random.default_rng(0)
+    half = np.array(lens.half_size)
+    sides = zip(half, lens.degree, z.shape, strict=True)
+    knots = tuple(np.r_[[-h] * p, np.linspace(-h, h, n - p + 1), [h] * p] for h, p, n in sides)
+    surface = NdBSpline(knots, z.numpy(), lens.degree)
+    o, power, index = np.c_[rng.uniform(-half, half, (rays, 2)), np.full(rays, lit.pupil.z)], np.full(rays, 1.0 / rays), 1.0
+
+    def through(normal, before, after):
+        """Direction beyond a surface with a unit normal along the light, (N, 3), and the transmittance."""
+        cosine = (d * normal).sum(-1, keepdims=True)
+        beyond = np.sqrt(np.maximum(1.0 - (before / after) ** 2 * (1.0 - cosine**2), 0.0))
+        s, p = ((a * cosine - b * beyond) / (a * cosine + b * beyond) for a, b in ((before, after), (after, before)))
+        return before / after * (d - cosine * normal) + beyond * normal, 1.0 - 0.5 * (s**2 + p**2)[..., 0]
+
+    if not lens.mirror:
+        d, passed = through(np.array([[0.0, 0.0, 1.0]]), 1.0, index := lens.index)
+        power = power * passed
+    d = np.broadcast_to(d, o.shape)
+    t = (4.0 - o[:, 2]) / d[:, 2]
+    for last in (False,) * 6 + (True,):
+        at = o + t[:, None] * d
+        inside = (abs(at[:, :2]) <= half).all(1)
+        on = np.clip(at[:, :2], -half, half)
+        slope = [surface(on, nu=nu) for nu in ((1, 0), (0, 1))]
+        if not last:
+            t = t - (at[:, 2] - surface(on)) / (d[:, 2] - slope[0] * d[:, 0] - slope[1] * d[:, 1])
+    normal = np.c_[-slope[0], -slope[1], np.ones(rays)] / np.sqrt(1.0 + slope[0] ** 2 + slope[1] ** 2)[:, None]
+    if lens.mirror:
+        d = d - 2.0 * (d * normal).sum(1)[:, None] * normal
+    else:
+        d, passed = through(normal, index, 1.0)
+        power = power * passed
+    x, y, across = map(np.array, lit.screen.axes)
+    away = np.array([*lit.screen.shift, lit.screen.z]) - at
+    landed = ((away @ across) / (d @ across))[:, None] * d - away
+    counts = [
+        np.histogram2d(landed @ x, landed @ y, lit.screen.resolution, [[-r, r] for r in lit.screen.half_size], weights=w * inside)[
+            0
+        ]
+        for w in (power, power**2)
+    ]
+    return counts[0], counts[1]
+
+
+@pytest.mark.parametrize(
+    ("tilt", "mirror"),
+    [((20.0, 0.0), False), ((0.0, -40.0), False), ((45.0, 48.0), False), ((0.0, 45.0), True), ((-30.0, 20.0), True)],
+)
+def test_an_independent_tracer_agrees(tilt, mirror):
+    """Within its noise, at 20, 40 and 62 degrees: the mean square of the deviation of a pixel over its standard deviation."""
+    lit, z = scene(tilt, wide=24.0 if mirror else 15.0, pixels=40, mirror=mirror), heights(0.06)
+    image, squares = traced(lit, z, 300_000)
+    ours = expose(lit, HeightField.of(lit.lens), z, rays_of(lit, "stratified", 20_000_000), Filter()).image.numpy()
+    each = squares.sum() / image.sum()
+    lit_by = ours > 25.0 * each
+    deviation = (image - ours)[lit_by] / np.sqrt(ours[lit_by] * each)
+    assert lit_by.sum() > 700, float((deviation**2).mean())
+    assert 0.9 < float((deviation**2).mean()) < 1.1
+
+
 def test_a_tilted_wave_is_a_wave_with_a_tilted_direction():
     """The tolerance of the direction turns rays that were sampled along the axis."""
     lit, z = scene(TILTS[1]), heights()
@@ -152,6 +218,32 @@ def test_a_tilted_wave_is_a_wave_with_a_tilted_direction():
     assert float(off) < 1e-9
     assert float(other.sum()) == pytest.approx(float(image.sum()), rel=3e-3)
     assert float((other - image).norm()) < 0.02 * float(image.norm())
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        {"lens": {"gradient": Gradient("axial", (0.02,))}},
+        {"lens": {"gradient": Gradient("radial", (-0.002,))}},
+        {"lens": {"entrance": FreeForm(0.02 * np.random.default_rng(0).standard_normal((8, 8)), (3, 3))}},
+        {"elements": (Component(30.0, (40.0, 40.0), radius=(60.0, 60.0), thickness=4.0, index=1.5),)},
+        {"elements": (FoldMirror(50.0, (60.0, 60.0), tilt=(45.0, 0.0)),)},
+    ],
+    ids=["axial gradient", "radial gradient", "two sides", "another lens", "fold mirror"],
+)
+def test_light_at_an_angle_through_whatever_else_a_scene_has(beside):
+    """It is that of a point far away, which is traced as light of a near source is."""
+    lens = replace(scene((0.0, 0.0), z_in=0.0, offset=Offset(5.0)).lens, **beside.get("lens", {}))
+    plain = Scene(PlaneWave(), lens, Screen((40.0, 40.0), 100.0, (20, 20)), elements=beside.get("elements", ()))
+    field, z, images = HeightField.of(lens), 1.0 + heights(), []
+    wave = PlaneWave(tilt=(8.0, -5.0))
+    for source in (wave, Points((tuple(-1e6 * c for c in wave.axis),))):
+        lit = replace(plain, source=source)
+        found = expose(lit, field, z, rays_of(lit, "stratified", 400_000))
+        assert float(found.image.sum()) + sum(found.lost.values()) == pytest.approx(1.0, abs=1e-12)
+        images.append(found.image.numpy() / (1.0 - found.lost["missed_lens"]))
+    assert images[0].sum() == pytest.approx(images[1].sum(), rel=1e-3) and images[0].sum() > 0.3
+    assert relative_rms(*images) < 0.03
 
 
 @pytest.mark.parametrize(("tilt", "mirror"), [((0.0, 40.0), False), ((-50.0, 20.0), False), ((0.0, 45.0), True)])
@@ -222,6 +314,25 @@ def turned(screen: Screen) -> tuple[Screen, Screen]:
     x, y, z = screen.axes
     over = replace(screen, tilt=tilt_to(x, (-z[0], -z[1], -z[2])))
     return over, replace(screen, tilt=tilt_to(y, z), resolution=screen.resolution[::-1], size=screen.size[::-1])
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_a_profile_is_that_over_the_aperture(mirror):
+    """Whatever the angle: a flat lens throws it on a screen parallel to it, displaced, and a flat mirror, too."""
+    profile = np.array([[1.0, 2.0, 0.5], [0.0, 3.0, 1.0]])
+    lit = scene((30.0, -25.0), 20.0, 20.0, mirror=mirror, z_in=0.0, offset=Offset(0.0 if mirror else 1e-3), min_thickness=0.0)
+    x, y, z = lit.source.axis
+    reach = 30.0 / z
+    lit = replace(
+        lit,
+        source=replace(lit.source, profile=profile),
+        screen=Screen(lit.lens.size, 30.0 * lit.lens.interaction.side, profile.shape, shift=(reach * x, reach * y)),
+    )
+    flat = torch.full((9, 8), 0.0 if mirror else 1e-3, dtype=torch.float64)
+    found = expose(lit, HeightField.of(lit.lens), flat, rays_of(lit, "stratified", 200_000), Filter())
+    image = found.image.numpy()
+    assert image.sum() + sum(found.lost.values()) == pytest.approx(1.0, abs=1e-12)
+    assert image / image.sum() == pytest.approx(profile / profile.sum(), abs=3e-3)
 
 
 @pytest.mark.parametrize("kind", ["lines", "sobol"])
@@ -301,6 +412,38 @@ def test_normal_incidence_is_untouched():
     assert type(traced.fused).__name__ == "PlaneImage"
 
 
+def written(*source: str) -> dict:
+    """[source] of a file, and a second [[source]], each with these lines."""
+    one = "\n".join(source)
+    return settings.parse(f"[[source]]\n{one}\n[[source]]\n{one}\n", "a.toml")["source"]
+
+
+@pytest.mark.parametrize("vector", [(0.0, 0.0, 2.0), (1.0, 0.0, 1.0), (-3.0, 40.0, 20.0)])
+def test_a_direction_as_a_vector(vector):
+    source = written(f"direction = {list(vector)}")
+    for table in (source, *source["also"]):
+        assert "direction" not in table
+        assert PlaneWave(tilt=tuple(table["tilt"])).axis == pytest.approx(np.array(vector) / np.linalg.norm(vector), abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["direction = [0, 0, 0]"], "z > 0"),
+        (["direction = [0, 1, -1]"], "z > 0"),
+        (["direction = [1, 0, 0]"], "within 80 degrees"),
+        (["direction = [nan, 0, 1]"], "a number"),
+        (["direction = [0, 0, inf]"], "finite"),
+        (["direction = [[0, 0, 1], [0, 1, 1]]"], "one finite vector"),
+        (["direction = [0, 1]"], "x, y, z"),
+        (["direction = [0, 1, 1]", "tilt = [45, 0]"], "not both"),
+    ],
+)
+def test_a_direction_that_is_none_is_refused(lines, words):
+    with pytest.raises(InputError, match=words):
+        written(*lines)
+
+
 @pytest.fixture
 def in_tmp(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -352,9 +495,13 @@ def test_nonsense_is_refused_in_a_line(in_tmp, capfd, options, words):
 def test_what_has_no_tilted_light_says_so(in_tmp, capfd):
     write_blob()
     assert design("--source-tilt", "20,0", "--quiet") == 0
-    for command in (["export", "p", "--format", "mitsuba", "-o", "scene.xml"], ["render", "p", "--html", "p.html"]):
-        assert cli.run(command) == 2
-        assert "tilted" in capfd.readouterr().err.splitlines()[-1]
+    assert cli.run(["export", "p", "--format", "lighttools", "--script", "-o", "p.npz"]) == 2
+    assert "--script" in capfd.readouterr().err.splitlines()[-1]
+    assert cli.run(["export", "p", "--format", "mitsuba", "-o", "scene.xml"]) == 0
+    assert cli.run(["export", "p", "--format", "zemax", "-o", "p.dat"]) == 0
+    head = (in_tmp / "p.dat").read_text().split("\n", 8)
+    assert any("light along (0, -0.342" in line for line in head)
+    assert any("tilted about the fixed x axis by 20 degrees" in line for line in head)
     assert cli.run(["export", "p", "--format", "stl", "-o", "p.stl"]) == 0
 
 

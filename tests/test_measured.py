@@ -27,7 +27,7 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.project.completion import complete
-from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
+from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.studies.retrace import converge
@@ -105,6 +105,27 @@ def test_light_that_misses_is_counted():
     state = drawn(measured(rays, position=(0.0, 0.0, -30.0)))
     assert state.power.tolist() == pytest.approx([0.1]) and state.lost["missed_lens"] == pytest.approx(0.9)
     assert (float(state.origin[0]), float(state.origin[1]), state.origin[2]) == (0.0, 0.0, 0.0)
+
+
+def test_a_turned_bundle_of_parallel_rays_is_a_tilted_plane_wave():
+    """Wider than the lens, which receives the part of its cross section that the tilted aperture cuts out."""
+    tilt, wide = (25.0, -30.0), 24.0
+    across = np.random.default_rng(0).uniform(-0.5 * wide, 0.5 * wide, (400_000, 3)) * [1, 1, 0]
+    rays = RaySet(across, np.broadcast_to([0.0, 0.0, 1.0], across.shape), np.ones(len(across)))
+    x, y = (60.0 * c / PlaneWave(tilt=tilt).axis[2] for c in PlaneWave(tilt=tilt).axis[:2])
+    screen = Screen((24.0, 24.0), 60.0, (12, 12), tilt=tilt, shift=(x, y))
+    field, z = HeightField.of(LENS), heights(LENS)
+    here, known = (
+        Scene(source, LENS, screen) for source in (measured(rays, position=(0.0, 0.0, -40.0), tilt=tilt), PlaneWave(tilt=tilt))
+    )
+    found, exact = (expose(one, field, z, rays_of(one, "grid", 10**6)) for one in (here, known))
+    part = math.prod(LENS.size) * known.source.axis[2] / wide**2
+    assert float(found.image.sum()) + math.fsum(found.lost.values()) == pytest.approx(1.0, abs=1e-12)
+    assert found.lost["missed_lens"] == pytest.approx(1.0 - part, abs=3e-3)
+    each = 1.0 / len(across)
+    lit = part * exact.image > 20 * each
+    score = (found.image - part * exact.image)[lit] / torch.sqrt(part * exact.image[lit] * each)
+    assert int(lit.sum()) > 30 and 0.5 < float(score.pow(2).mean()) < 1.5
 
 
 def test_a_part_is_even_and_changes_with_the_seed():
@@ -225,6 +246,22 @@ def run(capfd, *arguments, code=0):
     assert cli.run([*map(str, arguments), "--json", "--threads", "1"]) == code
     out, err = capfd.readouterr()
     return (json.loads(out), err) if code == 0 else err.strip()
+
+
+def test_a_file_turned_on_the_command_line(here, capfd):
+    """The screen stands square to its light; the exported lens has the same light, and a render of another direction another."""
+    Path("beam.tm25ray").write_bytes(tm25(*cone_of(60_000, 6.0)))
+    light = ["--source", "rays", "--source-file", "beam.tm25ray", "--source-tilt", "20,0"]
+    made, _ = run(capfd, "design", "blob.png", "--resolution", "24", "--control", "12", "--quality", "draft", *light, "-o", "p")
+    settings_ = Path("p/project.toml").read_text()
+    assert "tilt = [20.0, 0.0]" in settings_ and f"shift = [0.0, {-300.0 * math.tan(math.radians(20.0))!r}"[:20] in settings_
+    assert made["on_screen"] > 0.4 * (1.0 - made["lost"]["missed_lens"])
+    assert cli.run(["export", "p", "--format", "lighttools", "-o", "p.npz"]) == 0 and capfd.readouterr()
+    own, _ = run(capfd, "render", "p", "-o", "a.png")
+    same, _ = run(capfd, "render", "p.npz", "--source-file", "beam.tm25ray", "-o", "b.png")
+    straight, _ = run(capfd, "render", "p", "--source-tilt", "0,0", "-o", "c.png")
+    assert same["on_screen"] == pytest.approx(own["on_screen"], abs=1e-3) and straight["on_screen"] < 0.1 * own["on_screen"]
+    assert "80 degrees" in run(capfd, "render", "p", "--source-tilt", "70,60", "-o", "d.png", code=2)
 
 
 @pytest.mark.parametrize(("form", "name"), [(tm25, "led.tm25ray"), (zemax, "LED.SDF"), (lighttools, "led.txt")])

@@ -15,12 +15,17 @@ import numpy as np
 import pytest
 from helpers import write_blob
 from rayfiles import cone_of, tm25
+from test_direction import heights
+from test_direction import scene as at_angle
 
 from caustic_cli import cli, load
 from caustic_cli.export.page import MOST, PAGE, _coded, _lights, _onto, write_page
 from caustic_cli.io.colorimetry import _into_gamut, rgb_matrix
 from caustic_cli.io.files import is_ours
-from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
+from caustic_cli.scene import Disc, Lens, PlaneWave, Scene, Screen
 from caustic_cli.scene.sources.several import light_of_all, together
 from caustic_cli.studies.metrics import relative_rms
 
@@ -193,7 +198,7 @@ def test_rays_of_a_file_are_refused(home, monkeypatch, capfd):
     assert "not the rays of a file" in capfd.readouterr().err and not Path("rays.html").exists() and not Path("rays.png").exists()
     scene = load(home / "point.caustic").scene
     assert PAGE.supports(scene)
-    rays = replace(scene, source=SimpleNamespace(rays=1, members=(1,), nearest=-60.0, distant=False))
+    rays = replace(scene, source=SimpleNamespace(rays=1, members=(1,), nearest=-60.0, axis=(0.0, 0.0, 1.0)))
     assert "plane waves, points, grids and discs" in PAGE.why_not(rays)
 
 
@@ -237,6 +242,66 @@ def test_the_page_keeps_colours_in_the_gamut_as_images_do():
     program = "\n".join([*needed, f"console.log(JSON.stringify({colours.tolist()}.map(intoGamut)))"])
     found = json.loads(subprocess.run(["node", "-e", program], capture_output=True, text=True, check=True).stdout)
     np.testing.assert_allclose(found, _into_gamut(colours), rtol=0, atol=1e-6)
+
+
+#: A page traced by Node.js, without its document: the image of a setting, float64 [i, j], in base64.
+RUN = """
+const document = { getElementById: (id) => ({ textContent: id === "data" ? DATA : "" }) };
+SCRIPT
+(async () => {
+  const { cloud } = await unpacked(), beams = beamsOf(SETTING), steps = tracedHere(cloud, beams, SETTING.z, thinning(beams.length));
+  for (let step = steps.next(); ; step = steps.next()) if (step.done) {
+    console.log(Buffer.from(step.value.buffer).toString("base64"));
+    break;
+  }
+})();
+"""
+
+
+def by_node(page: Path, z: float, lean: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """The image that the page's functions trace with the screen at z, (n_x, n_y)."""
+    text = page.read_text("utf-8")
+    data = re.search(r'id="data">(.*?)</script>', text, re.S)[1]
+    script = re.search(r'("use strict";.*?)\nstart\(\)', text, re.S)[1]
+    setting = json.dumps({"z": z, "leanX": lean[0], "leanY": lean[1], "size": None})
+    program = RUN.replace("DATA", json.dumps(data)).replace("SETTING", setting).replace("SCRIPT", script)
+    found = subprocess.run(["node"], input=program, capture_output=True, text=True, check=True).stdout
+    return np.frombuffer(base64.b64decode(found), float).reshape(json.loads(data)["screen"]["resolution"])
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's functions")
+@pytest.mark.parametrize(
+    ("source", "mirror"),
+    [
+        (PlaneWave(tilt=(30.0, -25.0)), False),
+        (PlaneWave(tilt=(0.0, 45.0)), True),
+        (Disc(angle=5.0, tilt=(0.0, -60.0)), False),
+        (Disc(angle=40.0, tilt=(30.0, 15.0)), False),  # of which the aperture receives unequal parts
+    ],
+)
+def test_light_at_an_angle_is_traced_as_render_does(source, mirror, tmp_path):
+    """On a screen square to it, and on one that moves along it, as the page's throw does."""
+    lit = replace(at_angle(source.tilt, wide=30.0 if source.half_angle < 0.1 else 90.0, mirror=mirror), source=source)
+    field, z = HeightField.of(lit.lens), heights(0.01)
+    write_page(tmp_path / "page.html", lit, field, z)
+    for way in (1.0,) if source.extended else (1.0, 0.8):
+        x, y = (way * c for c in lit.screen.shift)
+        there = replace(lit, screen=replace(lit.screen, z=way * lit.screen.z, shift=(x, y)))
+        wanted = expose(there, field, z, rays_of(there, "stratified", 2_000_000)).image.numpy()
+        found = by_node(tmp_path / "page.html", there.screen.z)
+        assert found.sum() == pytest.approx(wanted.sum(), rel=0.01)
+        assert relative_rms(found, wanted) < 1.3 * ALIKE < relative_rms(found, wanted[::-1])
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's functions")
+def test_light_leans_from_its_own_direction(tmp_path):
+    lit = at_angle((30.0, 0.0), wide=30.0)
+    field, z = HeightField.of(lit.lens), heights(0.01)
+    write_page(tmp_path / "page.html", lit, field, z)
+    leaning = replace(lit, source=PlaneWave(tilt=(26.0, 0.0)))
+    wanted = expose(leaning, field, z, rays_of(leaning, "stratified", 1_000_000)).image.numpy()
+    found = by_node(tmp_path / "page.html", lit.screen.z, (0.0, 4.0))
+    assert relative_rms(found, wanted) < ALIKE < relative_rms(found, by_node(tmp_path / "page.html", lit.screen.z))
 
 
 def test_sources_of_which_one_has_no_colour_are_shown_in_grey():

@@ -41,6 +41,7 @@ def some(keys):
 @st.composite
 def written(draw):
     s = {section: draw(some(keys)) for section, keys in SCHEMA.items() if keys}
+    s.get("source", {}).pop("direction", None)  # is read as a tilt
     stages = draw(st.lists(some(STAGE).filter(bool), max_size=2))
     if stages:
         s["design"]["stages"] = stages

@@ -12,6 +12,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.lenslets import lenslets
 from caustic_cli.project.project import Project
 from caustic_cli.scene.sunlight import instants
+from caustic_cli.studies import day as study
 
 DAY = "2026-06-21T"
 SUNDIAL = ("--array", "2x1", "--sheet", "--slope", "30", "--screen", "floor:1m", "--picture-size", "60", "--lens-size", "20x10")
@@ -69,6 +70,25 @@ def test_each_lenslet_shows_its_picture_at_its_hour(in_tmp, capfd):
     for hour in found["hours"]:
         assert hour["contrast"] is None or hour["contrast"] > 5.0
         assert hour["relative_rms"] < 1.0  # the spots are as small as the sun's blur
+
+
+def test_a_day(in_tmp, capfd, monkeypatch):
+    """At its hour each picture is as designed where it stands; halfway to the next one it is beside its place, on either side."""
+    monkeypatch.setattr(study, "STEP", 30)
+    monkeypatch.setattr(study, "MOST_BETWEEN", 4)
+    assert design("--sun", SUN, "--quiet") == 0
+    capfd.readouterr()
+    assert cli.run(["render", "p", "--day", DAY[:-1], "--json", "--rays", "40000", "-o", "p.png"]) == 0
+    found = json.loads(capfd.readouterr().out)["day"]
+    assert (in_tmp / "p-day.gif").exists() and (in_tmp / "p-day.png").exists()
+    rows = {row["time"][11:16]: row for row in found["times"]}
+    for hour in ("13:00", "14:30"):
+        row = rows[hour]
+        assert row["moved"] == pytest.approx((0.0, 0.0), abs=1.0) and row["brightness"] == pytest.approx(1.0, abs=0.02)
+        assert row["on_screen"] > 0.95 and row["error"] == pytest.approx(row["followed_error"], abs=0.05)
+    before, after = rows["13:30"], rows["14:00"]  # the light of the hour before goes on as that of the next one comes
+    assert max(row["on_screen"] for row in (before, after)) < 0.3
+    assert before["moved"][0] * after["moved"][0] < 0 and min(abs(row["moved"][0]) for row in (before, after)) > 30.0
 
 
 def test_the_light_of_another_time(in_tmp, capfd):

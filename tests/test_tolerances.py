@@ -26,8 +26,9 @@ from caustic_cli.optics.misalignment import Misalignment, landing_points, reason
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
-from caustic_cli.optics.trace import Tracer
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.room import tilt_of
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.several import Several
 from caustic_cli.scene.tolerances import KINDS, FormError, Waviness, hypercube
@@ -331,6 +332,44 @@ def test_an_upright_mirror_is_close(error):
     (close,) = landing_points(error.upright(scene), field, heights, rays, Misalignment())
     apart = [float(torch.hypot(exact.x - o.x, exact.y - o.y).mean()) for o in (close, still)]
     assert apart[0] < 0.15 * apart[1] and apart[1] > 0.8
+
+
+@pytest.mark.parametrize("source", [PlaneWave(tilt=(30.0, -25.0)), Disc(angle=1.0, tilt=(0.0, 40.0))], ids=["plane", "sun"])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_direction_of_tilted_light_is_a_tolerance(tmp_path, source, axis):
+    """Its derivative is the difference of images in light of two other directions."""
+    plain, field, heights = small()
+    x, y, z = source.axis
+    screen = Screen((34.0, 34.0), 300.0 * z, (32, 32), source.tilt, (300.0 * x, 300.0 * y))
+    scene = replace(plain, source=source, screen=screen)
+    (tmp_path / "t.toml").write_text("[source_tilt]\nsigma = [0.5, 0.5]\n")
+    errors = schema.read(tmp_path / "t.toml")
+    found = study.Trials(scene, field, heights, np.ones((32, 32)), errors, rays=400_000)
+    assert [p.error for p in found.parameters] == ["source_tilt"] * 2
+    images, wanted = [], []
+    for sign in (-0.5, 0.5):
+        images.append(sum(found.images({("source_tilt", axis): sign}))[0])
+        turned = rotate_to_global(Pose(tilt=(sign, 0.0) if axis == 0 else (0.0, sign)), source.axis)
+        lit = replace(scene, source=replace(source, tilt=tilt_of(turned)))
+        wanted.append(expose(lit, field, heights, rays_of(lit, "stratified", 4_000_000)).image.numpy())
+    slope, known = ((b / b.mean() - a / a.mean()) / 1.0 for a, b in (images, wanted))
+    assert (slope * known).sum() / (known**2).sum() == pytest.approx(1.0, abs=0.04)
+    assert np.linalg.norm(slope - known) < 0.25 * np.linalg.norm(known)
+    row = {s.name: s for s in study.sensitivities(found)}[f"source_tilt {'xy'[axis]}"]
+    assert row.derivative == pytest.approx(np.sqrt((known**2).mean()), rel=0.05)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_an_error_of_the_distance_is_along_the_light(mirror):
+    """A picture in tilted light stays in the middle of a screen that is further away."""
+    lens = Lens((10.0, 10.0), control=(8, 8), offset=Offset(5.0), mirror=mirror)
+    side, source = lens.interaction.side, PlaneWave(tilt=(30.0, -25.0))
+    (x, y, z), tilt = source.axis, (30.0 * side, -25.0 * side)
+    scene = Scene(source, lens, Screen((34.0, 34.0), 100.0 * side * z, (32, 32), tilt, (100.0 * x, 100.0 * y)))
+    field, heights = HeightField.of(lens), torch.full((8, 8), 5.0, dtype=torch.float64)
+    rays = rays_of(scene, "stratified", 400, 4)
+    (still,), (moved,) = (landing_points(scene, field, heights, rays, e) for e in (Misalignment(), Misalignment(throw=10.0 * side)))
+    assert float((still.x - moved.x).abs().max()) < 1e-9 and float((still.y - moved.y).abs().max()) < 1e-9
 
 
 def test_the_best_shift_is_found():

@@ -171,14 +171,36 @@ def reflecting(scene):
     return replace(scene, lens=replace(scene.lens, mirror=True), screen=replace(scene.screen, z=-300.0, size=(60.0, 50.0)))
 
 
+def oblique(source, mirror=False):
+    """A change of the scene to light at an angle, and to a screen square to it or to the light that a mirror reflects."""
+
+    def changed(scene):
+        scene = reflecting(scene) if mirror else scene
+        side, (x, y, z) = scene.lens.interaction.side, (300.0 * c for c in source.axis)
+        screen = replace(scene.screen, z=side * z, tilt=tuple(side * angle for angle in source.tilt), shift=(x, y))
+        return replace(scene, source=source, screen=screen)
+
+    return changed
+
+
+OBLIQUE = {
+    "20 degrees": oblique(PlaneWave(tilt=(20.0, 0.0))),
+    "40 degrees": oblique(PlaneWave(tilt=(-30.0, 28.0))),
+    "60 degrees": oblique(PlaneWave(tilt=(0.0, 60.0))),
+    "sun": oblique(Disc(angle=0.5333, tilt=(0.0, -40.0))),
+    "mirror at 45 degrees": oblique(PlaneWave(tilt=(0.0, 45.0)), mirror=True),
+}
+
+
 def dispersing(scene):
     light = Light(wavelengths=(450.0, 550.0, 650.0), weights=(1.0, 2.0, 1.0))
     return replace(scene, lens=replace(scene.lens, glass="N-SF11", index=1.78), light=light)
 
 
-@pytest.mark.parametrize("how", [leaning, reflecting, dispersing, lambda scene: leaning(dispersing(scene))])
+@pytest.mark.parametrize("how", [leaning, reflecting, dispersing, lambda scene: leaning(dispersing(scene)), *OBLIQUE.values()])
 def test_scenes_are_written_and_compared_as_they_are(how, tmp_path, monkeypatch):
-    """Tilted and shifted screens, mirrors and several wavelengths, by a trace in place of Mitsuba's; a lens that leans differs."""
+    """Tilted and shifted screens, mirrors, several wavelengths and light at an angle, by a trace in place of Mitsuba's; a lens that
+    leans differs."""
     scene, field, heights = scene_with(PlaneWave())
     scene = how(scene)
     monkeypatch.setattr(verify, "find_spec", lambda name: True)
@@ -198,13 +220,9 @@ def test_scenes_are_written_and_compared_as_they_are(how, tmp_path, monkeypatch)
     assert not verify.verify(paths, scene, field, heights, RAYS).agree
 
 
-def test_a_leaning_screen_is_written_as_it_leans(tmp_path):
-    """Its corners by the transformations of the file, one after the other, are those of the screen."""
-    scene, field, heights = scene_with(PlaneWave())
-    scene = leaning(scene)
-    write_mitsuba(tmp_path / "a.xml", scene, field, heights, (17, 17), dark=True)
-    text = (tmp_path / "a.xml").read_text()
-    steps = re.search(r'id="screen">.*?<transform name="to_world">(.*?)</transform>', text, re.S)[1]
+def corners(text: str, name: str) -> np.ndarray:
+    """Corners of a rectangle of a file, (4, 3), by its transformations, one after the other."""
+    steps = re.search(rf'id="{name}">.*?<transform name="to_world">(.*?)</transform>', text, re.S)[1]
     points = np.array([(x, y, 0.0) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
     for kind, rest in re.findall(r"<(\w+) (.*?)/>", steps):
         v = {key: float(value) for key, value in re.findall(r'(\w+)="([^"]+)"', rest)}
@@ -215,11 +233,37 @@ def test_a_leaning_screen_is_written_as_it_leans(tmp_path):
         else:
             axis = [v.get("x", 0.0), v.get("y", 0.0), v.get("z", 0.0)]
             points = Rotation.from_rotvec(np.radians(v["angle"]) * np.array(axis)).apply(points)
+    return points
+
+
+def test_a_leaning_screen_is_written_as_it_leans(tmp_path):
+    scene, field, heights = scene_with(PlaneWave())
+    scene = leaning(scene)
+    write_mitsuba(tmp_path / "a.xml", scene, field, heights, (17, 17), dark=True)
+    points = corners((tmp_path / "a.xml").read_text(), "screen")
     hx, hy = scene.screen.half_size
     x, y = (c.ravel() for c in np.meshgrid([-hx, hx], [-hy, hy], indexing="ij"))
     wanted = np.stack(points_in_space(scene.screen, x, y), -1)
     order = [np.lexsort(np.round(p, 6).T) for p in (points, wanted)]
     assert np.allclose(points[order[0]], wanted[order[1]], atol=1e-6)
+
+
+@pytest.mark.parametrize("how", [oblique(PlaneWave(2.0, tilt=(-30.0, 28.0))), oblique(PlaneWave(tilt=(0.0, 45.0)), mirror=True)])
+def test_the_emitter_of_a_tilted_wave_lights_the_aperture(tmp_path, how):
+    """It is square to the beam and before the lens, covers the aperture, and has its power there."""
+    scene, field, heights = scene_with(PlaneWave())
+    scene = how(scene)
+    write_mitsuba(tmp_path / "a.xml", scene, field, heights, (17, 17))
+    text, axis = (tmp_path / "a.xml").read_text(), np.array(scene.source.axis)
+    points = corners(text, "light")
+    assert points[:, 2].max() < scene.pupil.z and np.ptp(points @ axis) < 1e-6
+    edges = points[1] - points[0], points[2] - points[0]
+    x, y = (c * r for c, r in zip(np.meshgrid([-1, 1], [-1, 1]), scene.pupil.half_size, strict=True))
+    for point in np.stack([x, y, np.full((2, 2), scene.pupil.z)], -1).reshape(4, 3):
+        for edge in edges:
+            assert -1e-6 <= (point - points[0]) @ edge / (edge @ edge) <= 1 + 1e-6
+    radiance = float(re.search(r'name="radiance" value="([^"]+)"', text)[1])
+    assert radiance * scene.pupil.aperture.area * axis[2] == pytest.approx(scene.source.power, rel=1e-6)
 
 
 # Mitsuba itself
@@ -237,20 +281,50 @@ def mitsuba():
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("source", SOURCES, ids=NAMES)
+@pytest.mark.parametrize(
+    "source",
+    [*SOURCES, *OBLIQUE.values(), leaning, reflecting, lambda scene: leaning(dispersing(scene))],
+    ids=[*NAMES, *OBLIQUE, "leaning screen", "mirror", "three wavelengths"],
+)
 def test_mitsuba_agrees(mitsuba, tmp_path, source, capsys):
-    scene, field, heights = scene_with(source)
-    write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (129, 129), dark=True)
-    decision = verify.verify([tmp_path / "lens.xml"], scene, field, heights, RAYS // 2)
+    if callable(source):
+        scene, field, heights = scene_with(PlaneWave())
+        scene = source(scene)
+    else:
+        scene, field, heights = scene_with(source)
+    paths = [tmp_path / f"{k}.xml" for k in range(len(scene.bands))]
+    for path, band in zip(paths, scene.bands, strict=True):
+        write_mitsuba(path, band.scene, field, heights, (129, 129), dark=True)
+    decision = verify.verify(paths, scene, field, heights, RAYS // 2)
     with capsys.disabled():
         print(
-            f"\n  {source.kind if hasattr(source, 'kind') else 'plane'}: mean Z^2 {decision.figures['z_mean_square']:.3f},"
+            f"\n  {scene.source.label}: mean Z^2 {decision.figures['z_mean_square']:.3f},"
             f" light {decision.figures['on_screen']:.5f} and {decision.figures['on_screen_render']:.5f}",
             end="",
         )
     assert decision.agree, decision.figures
     verify.write_panels(tmp_path / "verify.png", decision, scene)
     assert (tmp_path / "verify.png").read_bytes()[1:4] == b"PNG"
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["40 degrees", "mirror at 45 degrees"])
+def test_mitsuba_renders_what_is_exported(mitsuba, tmp_path, name):
+    """By its own light tracer, emitter and camera: the picture that is printed, neither flipped nor turned."""
+    import mitsuba as mi  # noqa: PLC0415
+
+    scene, field, heights = scene_with(PlaneWave())
+    scene = OBLIQUE[name](scene)
+    (w, h), n = scene.screen.size, 24
+    scene = replace(scene, screen=replace(scene.screen, resolution=(n, round(n * h / w))))
+    write_mitsuba(tmp_path / "a.xml", scene, field, heights, (129, 129))
+    mi.set_variant("scalar_rgb")  # its tracer of light runs with every LLVM
+    seen = np.array(mi.render(mi.load_file(str(tmp_path / "a.xml"), optimize=False), spp=200))[::-1, :, 0].T
+    power = np.pi * np.prod(scene.screen.pixel) * seen
+    ours = expose(scene, field, heights, rays_of(scene, "stratified", 400_000)).image.numpy()
+    assert power.sum() == pytest.approx(ours.sum(), rel=0.03)
+    like = [np.corrcoef(power.ravel(), a.ravel())[0, 1] for a in (ours, ours[::-1], ours[:, ::-1], ours[::-1, ::-1])]
+    assert like[0] > 0.9 and like[0] > max(like[1:]) + 0.05
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -6,7 +6,7 @@ Each function completes its own part of the settings, if present, for `completio
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
@@ -64,7 +64,7 @@ def complete_sunlight(source: SourceSettings, room: RoomSettings | None, array: 
     type = sources.type_of(source.type)
     if "tilt" not in type.keys:
         raise InputError(
-            f"⟨room.place⟩ needs ⟨source⟩ {alternatives(sources.used_by('tilt'))}, light from infinity, got {type.name}"
+            f"⟨room.place⟩ needs ⟨source⟩ {alternatives(sources.used_by('tilt'))}, whose light has a direction, got {type.name}"
         )
     light, _ = sunlight(room)
     times = sunlights.instants(room.time, math.prod(array))
@@ -72,11 +72,16 @@ def complete_sunlight(source: SourceSettings, room: RoomSettings | None, array: 
         return _of_sun(source, type, light, times[0])
     if source.also and len(source.also) != len(times) - 1:
         raise InputError(f"[[source]]: the sun of {len(times)} lenslets has as many [[source]], got {len(source.also) + 1}")
-    (n, m), first = array, source.without("also")
+    first = source.without("also")
     each = [first, *(source.also or [first.without(*FIRST)] * (len(times) - 1))]
-    read = [times[(m - 1 - j) * n + i] for i in range(n) for j in range(m)]  # as the pictures of a sheet are read, row by row
-    lit = [_of_sun(one, type, light, time) for one, time in zip(each, read, strict=True)]
+    lit = [_of_sun(one, type, light, time) for one, time in zip(each, in_reading_order(times, array), strict=True)]
     return lit[0].changed(also=lit[1:])
+
+
+def in_reading_order(times: Sequence[datetime], array: tuple[int, int]) -> list[datetime]:
+    """The time of each lenslet, j fastest, of times that are in the order in which the pictures of a sheet are read, row by row."""
+    n, m = array
+    return [times[(m - 1 - j) * n + i] for i in range(n) for j in range(m)]
 
 
 def _of_sun(source: SourceSettings, type: Any, light: Any, time: datetime) -> SourceSettings:
@@ -114,7 +119,7 @@ def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping
     """
     interaction, source = interaction_of(s.lens.mirror), build_source(s.source)
     if by.screen_place is None:
-        if not source.oblique:
+        if not source.lean:
             return s.screen
         x, y, z = (abs(s.screen.z) / source.axis[2] * c for c in source.axis)
         return s.screen.filled(tilt=[interaction.side * angle + 0.0 for angle in source.tilt], shift=[x + 0.0, y + 0.0])

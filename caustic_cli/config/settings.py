@@ -22,10 +22,12 @@ import tomli_w
 from caustic_cli import __version__
 from caustic_cli.errors import InputError, alternatives, near
 from caustic_cli.io.files import read_bytes
+from caustic_cli.loading import OnDemand
 from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
 from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import PLANE, Sags
+from caustic_cli.scene.sources.plane import GRAZING
 from caustic_cli.scene.sources.section import content
 from caustic_cli.schema.table import (
     TABLE,
@@ -44,6 +46,8 @@ from caustic_cli.schema.table import (
     default,
     in_section,
 )
+
+rooms = OnDemand("caustic_cli.scene.room")
 
 #: Settings as given, by section and key.
 Given = dict[str, dict[str, Any]]
@@ -123,12 +127,33 @@ def _section(section: str, table: Any, where: str) -> dict[str, Any]:
         table = {"list": table}
     if not isinstance(table, dict):
         raise InputError(f"{where}: {section} must be a section, written [{section}]")
-    return {
+    values = {
         key: _tables(value, where, *TABLES[section, key])
         if (section, key) in TABLES
         else _typed(f"{where}: [{section}] {key}", key, value, SCHEMA[section])
         for key, value in table.items()
     }
+    return _by_angles(values, f"{where}: [{section}]") if section == "source" else values
+
+
+def _by_angles(source: dict[str, Any], where: str) -> dict[str, Any]:
+    """A table of [source] in which a direction has become the tilt that it stands for.
+
+    Raises:
+        InputError: there is a tilt, too, or the light does not reach the lens from there.
+    """
+    if "direction" not in source:
+        return source
+    if "tilt" in source:
+        raise InputError(f"{where} takes direction or tilt, not both")
+    (x, y, z), *others = source["direction"]
+    if others or not 0 < z < math.inf or not math.hypot(x, y) <= z * math.tan(math.radians(GRAZING)):
+        raise InputError(
+            f"{where} direction must be one finite vector [x, y, z] with z > 0, within {GRAZING:g} degrees of +z, got"
+            f" {[[x, y, z], *others]}"
+        )
+    tilt = [angle + 0.0 for angle in rooms.tilt_of((x, y, z))]
+    return {key: value for key, value in source.items() if key != "direction"} | {"tilt": tilt}
 
 
 def toml_of(text: str, where: str) -> dict[str, Any]:
@@ -202,7 +227,8 @@ def _fits(value) -> bool:
 def _tables(tables, where: str, name: str, keys: dict[str, Setting]) -> list[dict[str, Any]]:
     if not isinstance(tables, list) or not (tables or name == "source") or not all(isinstance(t, dict) for t in tables):
         raise InputError(f"{where}: [[{name}]] must be a list of tables")
-    return [{k: _typed(f"{where}: [[{name}]] {k}", k, v, keys) for k, v in t.items()} for t in tables]
+    found = [{k: _typed(f"{where}: [[{name}]] {k}", k, v, keys) for k, v in t.items()} for t in tables]
+    return [_by_angles(table, f"{where}: [[{name}]]") for table in found] if name == "source" else found
 
 
 def _typed(where: str, key: str, value, keys: dict[str, Setting]):

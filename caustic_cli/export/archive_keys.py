@@ -67,7 +67,8 @@ KEYS: dict[str, tuple[Key, ...]] = {
         Key("source_power", "(k,)", "W or lm", "of each point; k = 1 for all others, of which those at infinity have it through"
             " the aperture"),
         Key("cone_half_angle", "", "degrees", "half angle of the emission, 0 for a plane wave"),
-        Key("source_tilt", "(2,)", "degrees", "rotations of +z about x, then y, to the axis of light from infinity; only if not 0"),
+        Key("source_tilt", "(2,)", "degrees", "rotations of +z about x, then y, to the axis of light from infinity or of"
+            " a ray file; only if not 0"),
         Key("source_profile", "(a, b)", "1", "relative irradiance over the aperture; only of a plane wave that is not uniform"),
         Key("source_size", "(2,)", "mm", "full widths of a disc at a finite distance"),
         Key("source_angle", "", "degrees", "angular diameter of a disc at infinity"),

@@ -289,7 +289,7 @@ def _of_plane(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _tilt(source: Source) -> dict[str, np.ndarray]:
-    return {"source_tilt": _reals(source.tilt)} if source.oblique else {}
+    return {"source_tilt": _reals(source.tilt)} if source.lean else {}
 
 
 def _of_points(scene: Scene) -> dict[str, np.ndarray]:
@@ -318,7 +318,7 @@ def _of_rays(scene: Scene) -> dict[str, np.ndarray]:
     `source_rays_sha256`, by which the file is recognised."""
     source, lens = scene.source, scene.lens
     cone = _reals(np.degrees(source.cone_over(lens.pupil)))
-    return {"cone_half_angle": cone, "source_rays_sha256": np.array(source.rays.digest)}
+    return {"cone_half_angle": cone, "source_rays_sha256": np.array(source.rays.digest)} | _tilt(source)
 
 
 #: Further keys of a source, by its kind.

@@ -5,11 +5,11 @@ and `NAME-holder.ply` of a round lens (binary, float64).
     element-1-front  surfaces of other lenses, and mirrors, with black sides and a black frame; behind a mirror the screen and the
                      camera stand on the folded axis
     sides, holder    black: light that leaves through the sides or misses the lens is lost, as in a render
-    screen           white and diffuse; a camera between lens and screen, whose image is flipped to the view from +z
-    light            a plane wave as a collimated area, points as spots, a disc as a Lambertian area
+    screen           white and diffuse; a camera between lens and screen, whose image is flipped to the view from its +z
+    light            a plane wave as a collimated area, square to the wave, points as spots, a disc as a Lambertian area
 
-A mirror is its surface alone, a perfect `conductor` with a black back; the camera is between it and the screen, and views its +z
-side, which the mirror illuminates.
+A mirror is its surface alone, a perfect `conductor` with a black back; the camera is between it and the screen, and views the side
+that the mirror illuminates.
 
 The integrator traces light (`ptracer`), four surfaces deep: entrance, exit, screen, camera.  With radiance L in the image,
 pi L times a pixel's area is its power.  Lengths are mm, so radiance is W / (mm^2 sr).
@@ -21,6 +21,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from operator import mul
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -43,6 +44,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Aperture, CircularAperture, Lens, Scene, Screen
 from caustic_cli.scene.elements import surface_name
+from caustic_cli.scene.screen import tilted
 
 #: Samples per pixel of the scene, Mitsuba's `spp`.
 SAMPLES = 256
@@ -115,7 +117,7 @@ def _lens_files(scene: Scene) -> list[str]:
 
 def _lens(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]) -> list[str]:
     """The scene of a lens with these free-form sides, after writing its meshes."""
-    lens, screen, (*fronts, surface) = scene.lens, scene.screen, sides
+    lens, (*fronts, surface) = scene.lens, sides
     glass, onto, flat = _glass(lens.index), _onto(scene), _FLATS[lens.aperture]
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     rim = points[rim_of(*surface.points.shape[:2])]
@@ -126,16 +128,15 @@ def _lens(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]) 
         low, entrance = rim * [1.0, 1.0, 0.0] + [0.0, 0.0, lens.z_in], _flat_entrance(lens, flat.shape, glass)
     write_mesh(_beside(path, "exit"), points, triangles(surface.points), normals)
     write_mesh(_beside(path, "sides"), *_strip(rim, low))
-    away = 0.9 * (screen.z - max(float(points[:, 2].max()), *(e.extent[1] for e in scene.behind), -math.inf))
-    place = f'<scale x="-1"/>{_moved(screen, screen.z - away)}{onto}'
+    before = max(float(points[:, 2].max()), *(e.extent[1] for e in scene.behind), -math.inf)
     return [
-        *_camera(screen, away, place, len(System.of(scene).elements) + 2),
+        *_camera(scene, before, onto, len(System.of(scene).elements) + 2),
         *entrance,
         f'<shape type="ply" id="exit">{_file(path, "exit")}{glass}</shape>',
         f'<shape type="ply" id="sides">{_file(path, "sides")}<boolean name="face_normals" value="true"/>{BLACK}</shape>',
         *flat.holder(path, lens),
         *_others(path, scene),
-        *_screen(screen, SPIN, onto),
+        *_screen(scene, onto),
         *light,
     ]
 
@@ -209,16 +210,16 @@ def _mirror(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]
     Raises:
         InputError: something obstructs the light of a near source.
     """
-    screen, lens, surface = scene.screen, scene.lens, sides[-1]
+    lens, surface = scene.lens, sides[-1]
     if not scene.source.collimated:
         refuse_obstructed(scene, designed=True)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     write_mesh(_beside(path, "mirror"), points, triangles(surface.points)[:, ::-1], -normals)  # towards the light
-    away = 0.9 * (min(float(points[:, 2].min()), lens.z_in) - BEFORE - screen.z)
+    before = min(float(points[:, 2].min()), lens.z_in) - BEFORE
     return [
-        *_camera(screen, away, f'<rotate y="1" angle="180"/>{_moved(screen, screen.z + away)}'),
+        *_camera(scene, before),
         f'<shape type="ply" id="mirror">{_file(path, "mirror")}{MIRRORED}</shape>',
-        *_screen(screen, ""),
+        *_screen(scene),
         *(line.replace("</shape>", '<bsdf type="null"/></shape>') for line in light),
     ]
 
@@ -232,9 +233,19 @@ def _onto(scene: Scene) -> str:
     return f'<matrix value="{" ".join(real(v) for row in (*rows, (0.0, 0.0, 0.0, 1.0)) for v in row)}"/>'
 
 
-def _camera(screen: Screen, away: float, place: str, depth: int = DEPTH) -> list[str]:
-    """First lines of the scene: integrator, and a camera `away` mm from the screen, which fills its image."""
-    sx, sy = screen.half_size
+def _facing(scene: Scene) -> bool:
+    """Whether the normal of the screen is along its light, not against it."""
+    return sum(map(mul, scene.undeviated, scene.screen.axes[2])) > 0
+
+
+def _camera(scene: Scene, before: float, onto: str = "", depth: int = DEPTH) -> list[str]:
+    """First lines of the scene: integrator, and a camera on the normal of the screen, on the side of the light, whose image the
+    screen fills; before: z of the axis from which its plane is away; onto: transformation to a folded axis."""
+    screen, (sx, sy), (x, y, z) = scene.screen, scene.screen.half_size, scene.screen.centre
+    away = 0.9 * abs(sum(map(mul, (x, y, z - before), screen.axes[2])))
+    seen = f'<scale x="-1"/><translate z="{real(-away)}"/>'
+    if not _facing(scene):
+        seen = f'<rotate y="1" angle="180"/><translate z="{real(away)}"/>'
     width, height = screen.resolution[0], max(1, round(screen.resolution[0] * sy / sx))
     return [
         f"<!-- {CREATED}; millimetres -->",
@@ -244,7 +255,7 @@ def _camera(screen: Screen, away: float, place: str, depth: int = DEPTH) -> list
         '  <string name="fov_axis" value="x"/>',
         f'  <float name="fov" value="{real(2.0 * math.degrees(math.atan2(sx, away)))}"/>',
         f'  <float name="near_clip" value="{real(0.5 * away)}"/><float name="far_clip" value="{real(2.0 * away)}"/>',
-        f'  <transform name="to_world">{place}</transform>',
+        f'  <transform name="to_world">{seen}{_stood(screen)}{onto}</transform>',
         f'  <sampler type="independent"><integer name="sample_count" value="{SAMPLES}"/></sampler>',
         f'  <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/>',
         '    <string name="pixel_format" value="luminance"/><rfilter type="box"/></film>',
@@ -252,28 +263,27 @@ def _camera(screen: Screen, away: float, place: str, depth: int = DEPTH) -> list
     ]
 
 
-def _screen(screen: Screen, spin: str, onto: str = "") -> list[str]:
-    """White rectangle facing +z, or -z with `spin`, tilted about its centre; onto: transformation to a folded axis."""
-    sx, sy = screen.half_size
-    leaning = "".join(f'<rotate {axis}="1" angle="{real(t)}"/>' for axis, t in _turns(screen.tilt) if t)
+def _screen(scene: Scene, onto: str = "") -> list[str]:
+    """White rectangle that faces its light; onto: transformation to a folded axis."""
+    (sx, sy), spin = scene.screen.half_size, SPIN if _facing(scene) else ""
     return [
         '<shape type="rectangle" id="screen">',
         '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
-        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/>{leaning}{_moved(screen, screen.z)}{onto}'
-        "</transform>",
+        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/>{_stood(scene.screen)}{onto}</transform>',
         "</shape>",
     ]
 
 
-def _turns(tilt: Sequence[float]) -> list[tuple[str, float]]:
-    """The rotations of `scene.screen.tilted` in their order, axes and degrees."""
-    return [*zip("z", tilt[2:], strict=False), *zip("xy", tilt, strict=False)]
+def _turns(tilt: Sequence[float]) -> str:
+    """The rotations of `scene.screen.tilted` in their order."""
+    turns = [*zip("z", tilt[2:], strict=False), *zip("xy", tilt, strict=False)]
+    return "".join(f'<rotate {axis}="1" angle="{real(angle)}"/>' for axis, angle in turns if angle)
 
 
-def _moved(screen: Screen, z: float) -> str:
-    """Translation to z on the line through the centre of the screen along its axis."""
+def _stood(screen: Screen) -> str:
+    """Transformation of a screen in the plane z = 0 to its place: tilted about its centre, and moved."""
     shift = "".join(f' {axis}="{real(c)}"' for axis, c in zip("xy", screen.shift, strict=True) if c)
-    return f'<translate{shift} z="{real(z)}"/>'
+    return f'{_turns(screen.tilt)}<translate{shift} z="{real(screen.z)}"/>'
 
 
 def quick_samples(field: HeightField) -> tuple[int, int]:
@@ -335,14 +345,22 @@ def _light(scene: Scene) -> list[str]:
 
 
 def _collimated(scene: Scene) -> list[str]:
-    """Collimated emitter of a plane wave, as wide as the lens."""
+    """Collimated emitter of a plane wave, as wide as the lens; of a tilted one the rectangle around the beam through the aperture,
+    at right angles to it, of which the holder stops the rest."""
     source, pupil = scene.source, scene.pupil
-    (rx, ry), radiance = pupil.half_size, real(source.power / pupil.aperture.area)
+    half, axes, shape = pupil.half_size, tilted(source.tilt), _FLATS[pupil.aperture.name].shape
+    back = scene.lowest - BEFORE - pupil.z
+    if source.oblique:
+        shape = _FLATS[Aperture.name].shape
+        half = tuple(sum(r * abs(c) for r, c in zip(pupil.half_size, axis, strict=False)) for axis in axes[:2])
+        back -= sum(h * abs(axis[2]) for h, axis in zip(half, axes, strict=False))
+    x, y, z = (c * back / axes[2][2] for c in axes[2])
+    radiance = source.power / (pupil.aperture.area * axes[2][2])
     return [
-        f'<shape type="{_FLATS[pupil.aperture.name].shape}" id="light">',
-        f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
-        f'<translate z="{real(scene.lowest - BEFORE)}"/></transform>',
-        f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>',
+        f'<shape type="{shape}" id="light">',
+        f'  <transform name="to_world"><scale x="{real(half[0])}" y="{real(half[1])}"/>{_turns(source.tilt)}'
+        f'<translate x="{real(x)}" y="{real(y)}" z="{real(z + pupil.z)}"/></transform>',
+        f'  <emitter type="directionalarea"><rgb name="radiance" value="{real(radiance)}"/></emitter>',
         "</shape>",
     ]
 

@@ -28,11 +28,10 @@ _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     "lighttools": {"user-defined source": SOURCE},
     "mitsuba": {
         **dict.fromkeys(
-            [name for name in BEYOND_CLEAR if name not in ("mirror", "gradient index", "shifted screen")],
-            "⟨format⟩ mitsuba is written for clear lenses and straight screens, not {}",
+            [name for name in BEYOND_CLEAR if name not in ("mirror", "gradient index", "tilted screen", "shifted screen")],
+            "⟨format⟩ mitsuba is written for clear lenses and plane screens, not {}",
         ),
         **dict.fromkeys(("ray file", "several sources", "user-defined source"), SOURCE),
-        "tilted light": "⟨format⟩ mitsuba: its collimated emitter is along the axis, so tilted light cannot be written",
         "uneven plane wave": "⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written",
         **dict.fromkeys(
             ("disc at infinity", "disc not Lambertian", "disc in a cone"),
@@ -61,6 +60,8 @@ SCRIPT = Capability(
         **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
         **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
         "gradient index": SHAPE,
+        "tilted light": "⟨script⟩: its source shines along the axis, so light at an angle, which the archive alone holds, cannot be"
+        " written",
         "lumens": "⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written",
         "uneven plane wave": "⟨script⟩: its source is uniform, so one with a profile cannot be written",
         **dict.fromkeys(

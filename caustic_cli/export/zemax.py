@@ -11,6 +11,7 @@ zero derivatives OpticStudio uses finite differences, with an error of 0.05 mm a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -48,12 +49,15 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
     vertex = float(field.at(heights, *torch.zeros(2, 1, dtype=torch.float64), [(0, 0)])[0])
     columns = grid.z - vertex, grid.zx, grid.zy, grid.zxy
     table = np.stack([c[:, ::-1].T.ravel() for c in columns], -1)
-    lens = scene.lens
+    lens, (sx, sy) = scene.lens, scene.screen.shift
     head = [
         f"! {CREATED}",
         "! Grid Sag, mm; base radius infinity, conic 0; interpolation bicubic",
         f"! vertex {real(vertex - lens.z_in)} mm behind the flat entrance, index {real(lens.index)},"
         f" screen {real(scene.screen.z - vertex)} mm behind the vertex",
+        *([f"! light along ({', '.join(map(real, scene.source.axis))}), a unit vector"] if scene.source.oblique else []),
+        *([f"! screen decentred by x {real(sx)} mm, y {real(sy)} mm"] if any((sx, sy)) else []),
+        *([f"! screen tilted about {_turns(scene.screen.tilt)}"] if any(scene.screen.tilt) else []),
         *([f"! the screen is {scene.screen.shape_words()}, which this file does not contain"] if scene.screen.curved else []),
         *(["! along the axis, which flat mirrors fold, that this file does not contain"] if scene.elements else []),
         *([f"! circular aperture of radius {real(lens.half_size[0])} mm"] if lens.opening.round else []),
@@ -63,6 +67,12 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
     with atomic_file(path) as file:
         file.write("\r\n".join(head).encode())
         file.writelines(rows(table, f"{f'%.{DIGITS}g ' * 4}0\r\n"))
+
+
+def _turns(tilt: Sequence[float]) -> str:
+    """The rotations of a screen about its centre, as `scene.screen.tilted` takes them, in words."""
+    turns = [*zip("z", tilt[2:], strict=False), *zip("xy", tilt, strict=False)]
+    return ", then ".join(f"the fixed {axis} axis by {real(angle)} degrees" for axis, angle in turns if angle)
 
 
 def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:

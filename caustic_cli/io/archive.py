@@ -22,7 +22,7 @@ from caustic_cli.scene import Component, Disc, FreeForm, Lens, Light, Offset, Pl
 from caustic_cli.scene.elements import COMPONENTS, SIDES
 from caustic_cli.scene.light import MAX_WAVELENGTHS
 from caustic_cli.scene.materials import material
-from caustic_cli.scene.screen import MAX_SAGS, Sags
+from caustic_cli.scene.screen import MAX_SAGS, Sags, tilted
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 from caustic_cli.scene.sources.points import MAX_POINTS
 from caustic_cli.scene.sources.rays import Measured
@@ -224,8 +224,9 @@ def _measured(data: Archive, rays: RaySet | None) -> Measured:
         raise InputError("its source is a ray file, which an archive does not contain: ⟨+source.file⟩ names it")
     if "source_rays_sha256" in data and data.text("source_rays_sha256") != rays.digest:
         raise InputError("⟨source.file⟩ holds other rays than those of its source; render its project under another light")
-    x, y, z = np.subtract(_positions(data)[0], rays.focus).tolist()
-    return Measured(rays, (x, y, z), _power(data))
+    tilt = _pair(data, "source_tilt")
+    x, y, z = (np.array(tilted(tilt)) @ _positions(data)[0] - rays.focus).tolist()
+    return Measured(rays, (x, y, z), _power(data), tilt)
 
 
 def _plane(data: Archive) -> PlaneWave:

@@ -386,7 +386,7 @@ class OneSurface(Problem):
         x, y = (c.numpy() for c in self.field(0).control_xy())
         vertex, index = lens.offset.thickness, lens.effective_index
         slope = [c / ((index - 1.0) * (screen.z - vertex)) for c in screen.shift]
-        if source.oblique:
+        if source.lean:
             slope = BeamProjection(screen, vertex, lens.interaction.side, source.axis).lean(index)
         return torch.from_numpy(lens.offset.heights(x, y) + slope[0] * x[:, None] + slope[1] * y[None, :])
 

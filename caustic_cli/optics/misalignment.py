@@ -77,11 +77,16 @@ class Misalignment:
         x, y, z = rotate_to_local(pose, tuple(p - o for p, o in zip(point, pose.position, strict=True)))
         return x, y, z + scene.lens.z_in
 
+    def away(self, scene: Scene) -> tuple[float, float, float]:
+        """Displacement of the screen by the error of its distance, in its frame: along the light, towards +z."""
+        x, y, z = (math.copysign(self.throw, self.throw * scene.undeviated[2]) * c for c in scene.undeviated)
+        return x, y, z
+
     def screen(self, scene: Scene) -> tuple[tuple[float, float, float], tuple]:
         """Centre, mm, and axes of the screen in the frame of the lens."""
-        s, pose = scene.screen, self.lens_pose(scene)
+        s, pose, away = scene.screen, self.lens_pose(scene), self.away(scene)
         tilt = (s.tilt[0] + self.screen_tilt[0], s.tilt[1] + self.screen_tilt[1], *s.tilt[2:])
-        centre = (s.shift[0] + self.screen_shift[0], s.shift[1] + self.screen_shift[1], s.z + self.throw)
+        centre = (s.shift[0] + self.screen_shift[0] + away[0], s.shift[1] + self.screen_shift[1] + away[1], s.z + away[2])
         axes = tuple(rotate_to_local(pose, s.in_space(axis)) for axis in Pose(tilt=tilt).axes)
         return self.point(scene, s.in_space(centre)), axes
 
@@ -122,11 +127,10 @@ class Misalignment:
             across, along = (d / (2.0 * r) for d, r in zip(aside, scene.pupil.half_size, strict=True))
             return replace(cast(Any, source), profile=displaced(source.profile, (across, along)))
         if isinstance(source, Measured):
-            turn = np.array(self.lens_pose(scene).axes)
-            rays = source.rays
+            rays = source.turned
             if any(self.lens_tilt):
-                rays = replace(rays, positions=rays.positions @ turn.T, directions=rays.directions @ turn.T)
-            return replace(source, rays=rays, position=moved(source.position))
+                rays = rays.turned(np.array(self.lens_pose(scene).axes).T)
+            return replace(source, rays=rays, position=moved(source.origin.tolist()), tilt=(0.0, 0.0))
         return source.displaced(moved, scale, rotate_to_local(self.lens_pose(scene), source.axis))
 
     def upright(self, scene: Scene) -> Scene:

@@ -107,7 +107,7 @@ class Scene:
     @property
     def undeviated(self) -> Vector:
         """Unit direction, in the frame of the screen, of light along the source's axis behind a surface without slopes."""
-        if self.elements or not self.source.distant:
+        if self.elements:
             return 0.0, 0.0, float(self.lens.interaction.side)
         return self.lens.interaction.sent(self.source.axis)
 

@@ -50,12 +50,17 @@ class Room:
         return east, north, up
 
     def tilt(self, direction: Vector) -> tuple[float, float]:
-        """Rotations (A, B), degrees, that turn +z of the lens into a direction of light (east, north, up), a unit vector: those of
-        `screen.tilted`, whose z axis is (sin B cos A, -sin A, cos B cos A).  |B| > 90 of light that comes from the room."""
-        x, y, z = self.to_lens(direction)
-        return math.degrees(math.atan2(-y, math.hypot(x, z))), math.degrees(math.atan2(x, z))
+        """Rotations (A, B), degrees, that turn +z of the lens into a direction of light (east, north, up): see `tilt_of`."""
+        return tilt_of(self.to_lens(direction))
 
     def incidence(self, direction: Vector) -> float:
         """Angle between light and the inner normal, degrees; beyond 90 it comes from the room."""
         x, y, z = self.to_lens(direction)
         return math.degrees(math.atan2(math.hypot(x, y), z))
+
+
+def tilt_of(direction: Vector) -> tuple[float, float]:
+    """Rotations (A, B), degrees, that turn +z into a direction along the axes of the lens, of any length: those of `screen.tilted`,
+    whose z axis is (sin B cos A, -sin A, cos B cos A).  |B| > 90 of light that comes from the room."""
+    x, y, z = direction
+    return math.degrees(math.atan2(-y, math.hypot(x, z))), math.degrees(math.atan2(x, z))

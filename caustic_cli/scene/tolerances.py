@@ -38,7 +38,7 @@ XY, ABOUT = ("x", "y"), ("x", "y")
 KINDS = {
     "index": Kind(("",), "", 0.5, "refractive index, at every wavelength alike"),
     "thickness": Kind(("",), "mm", 1e3, "centre thickness of the lens: the exit as a whole is shifted along the axis"),
-    "throw": Kind(("",), "mm", 1e6, "distance of the screen"),
+    "throw": Kind(("",), "mm", 1e6, "distance of the screen, along the light"),
     "source_shift": Kind(XY, "mm", 1e6, "decentre of a source at a finite distance, or of the beam of a plane wave with a profile"),
     "source_distance": Kind(("",), "mm", 1e6, "axial shift of a source at a finite distance"),
     "source_size": Kind(("",), "", 0.25, "width of a disc or grid, as a fraction of itself"),

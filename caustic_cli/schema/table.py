@@ -234,9 +234,12 @@ class SourceSettings(Section):
             " lens", option=Option("--cone", "DEG", BOTH))
     angle: float | None = setting("disc at infinity (the sun: 0.533): angular diameter", "degrees", 0.0, 170.0,
             derived="a disc at a finite distance", option=Option("--source-angle", "DEG", BOTH))
-    tilt: Pair = setting("direction of a plane wave or of a disc at infinity: +z turned about the x axis, then about the y axis;"
-            " the screen stands square to its light unless told otherwise", "degrees", -80.0, 80.0, default=[0.0, 0.0],
-            written=False, option=Option("--source-tilt", "A,B", BOTH))
+    tilt: Pair = setting("direction of a plane wave or of a disc at infinity: +z turned about the x axis, then about the y axis,"
+            " as a ray file is, with its position, about the lens' origin; the screen of a new design stands square to it unless"
+            " told otherwise, that of a finished lens stays", "degrees", -80.0, 80.0, default=[0.0, 0.0], written=False,
+            option=Option("--source-tilt", "A,B", BOTH))
+    direction: Point | None = setting("that direction as a vector [x, y, z] of any length, z > 0, instead of tilt, as which a"
+            " project keeps it")
     intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of"
             " degrees from +z and relative intensity", default="uniform", why="an isotropic source, the simplest",
             option=Option("--intensity", "uniform|lambertian|FILE", BOTH), file="intensity")

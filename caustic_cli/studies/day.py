@@ -13,15 +13,19 @@ Notation
                 or as designed
     on screen   legible, and at least PART of the power of the followed picture still lands on the screen where it stands
 
+Of a sundial the picture is at each time that of the nearest of its hours, with F_0, P_0 and C of its own; it is on the screen as
+far as its target is, displaced as it is.
+
 Powers are those of a beam of constant irradiance across it, of which the pane receives the cosine of its incidence: air, which
 weakens a low sun, is not in them.  Stray light is left out: ghosts, and what meets a surface twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta, tzinfo
+from functools import cached_property
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, TypeVar
@@ -51,7 +55,7 @@ DAY = Capability(
     "a day of sunlight",
     {
         "curved screen": "⟨day⟩ moves a plane screen after its picture, and this scene has {}",
-        "several sources": "⟨day⟩ follows one sun, and this scene has {}; ⟨+room.place⟩ with a single time gives it one",
+        "sources at once": "⟨day⟩ follows one sun, and this scene has {}; ⟨+room.place⟩ with a single time gives it one",
     },
 )
 #: Rays of a time, both halves included, and by how many times fewer match the picture to the target.
@@ -91,13 +95,21 @@ class Instant:
     followed: float
     #: By how much the picture has moved along the screen's x and y since the light of the design, mm.
     moved: tuple[float, float]
+    #: The largest F of a picture as designed, and of a legible one.
+    bounds: tuple[float, float]
     #: Power on the picture over P_0; part of the power of the followed picture's screen that is on that where it stands.
     brightness: float
     on_screen: float
 
-    def within(self, bound: float) -> bool:
-        """Whether the picture is bright enough, and its F after following within a bound."""
-        return self.followed <= bound and self.brightness >= DIM
+    @property
+    def as_designed(self) -> bool:
+        """Whether the picture is, wherever it is."""
+        return self.followed <= self.bounds[0] and self.brightness >= DIM
+
+    @property
+    def legible(self) -> bool:
+        """Whether it is, wherever it is."""
+        return self.followed <= self.bounds[1] and self.brightness >= DIM
 
 
 @dataclass(frozen=True)
@@ -145,7 +157,11 @@ class Follower:
         self._image, self.offset, self.error, _ = self._followed(scene, (0.0, 0.0))
         self._power = self._on_picture(self._image) * scene.source.axis[2]
 
-    @property
+    def of(self, time: datetime) -> Follower:
+        """The follower of the picture that is looked for at a time."""
+        return self
+
+    @cached_property
     def bounds(self) -> tuple[float, float]:
         """The largest F of a picture as designed, and of a legible one."""
         grey, as_designed = self.target.sum(0) if self.target.ndim == 3 else self.target, FACTOR * self.error + MORE
@@ -176,10 +192,18 @@ class Follower:
             self._error(still) if still is not None and lands > LEAST * whole else None,
             followed,
             (at[0] - self.offset[0], at[1] - self.offset[1]),
+            self.bounds,
             self._on_picture(image) * cosine / self._power if self._power else 0.0,
             lands / whole if whole else 0.0,
         )
         return Looked(instant, image * cosine, around * cosine)
+
+    def kept(self, moved: tuple[float, float]) -> float:
+        """Part of the target that is on the screen where it stands after a displacement along the screen's axes, mm."""
+        light = self.target.sum(0) if self.target.ndim == 3 else self.target
+        pixels = [round(d / w) for d, w in zip(moved, self.scene.screen.pixel, strict=True)]
+        i, j = (slice(max(0, -k), max(0, n - max(0, k))) for k, n in zip(pixels, light.shape, strict=True))
+        return float(light[i, j].sum() / light.sum())
 
     def _where_it_stands(self, scene: Scene, landing: Landing) -> tuple[np.ndarray, list[Image] | None]:
         """Image around the screen where it stands, and halves of that on it; black and None where no light comes near it."""
@@ -231,6 +255,40 @@ class Follower:
         return [(p.x, p.y, p.power) for p in landing_points(scene, *self._coarse, rays, Misalignment())]
 
 
+class SundialFollower:
+    """Follows the pictures of a sundial, at each time that of the nearest of its hours.
+
+    Args:
+        followers: of the pictures, each in a scene with the light of its own hour.
+        hours: their times of day, in the same order.
+    """
+
+    def __init__(self, followers: Sequence[Follower], hours: Sequence[datetime]):
+        self.followers = sorted(zip([_minutes(hour) for hour in hours], followers, strict=True), key=lambda one: one[0])
+        self.error = float(np.mean([follower.error for follower in followers]))
+
+    def of(self, time: datetime) -> Follower:
+        """As of a follower."""
+        return min(self.followers, key=lambda one: abs(one[0] - _minutes(time)))[1]
+
+    @cached_property
+    def bounds(self) -> tuple[float, float]:
+        """Their means."""
+        as_designed, legible = np.mean([follower.bounds for _, follower in self.followers], axis=0).tolist()
+        return as_designed, legible
+
+    def at(self, time: datetime) -> Looked:
+        """As of a follower; other pictures are not counted as parts of this one on the screen where it stands."""
+        follower = self.of(time)
+        seen = follower.at(time)
+        return replace(seen, instant=replace(seen.instant, on_screen=follower.kept(seen.instant.moved)))
+
+
+def _minutes(time: datetime) -> float:
+    """Minutes since midnight of its day."""
+    return time.hour * 60.0 + time.minute + time.second / 60.0
+
+
 def _coarse(field: HeightField, heights: Tensor) -> tuple[HeightField, Tensor]:
     """The surface without the detail that makes the picture, and its control heights."""
     x, y = (torch.linspace(-r, r, COARSE, dtype=torch.float64) for r in field.half_size)
@@ -261,17 +319,17 @@ class Day:
     @property
     def as_designed(self) -> Hours:
         """When the picture is as designed, wherever it is."""
-        return self._periods(lambda i: i.within(self.bounds[0]))
+        return self._periods(lambda i: i.as_designed)
 
     @property
     def legible(self) -> Hours:
         """When it is legible, wherever it is."""
-        return self._periods(lambda i: i.within(self.bounds[1]))
+        return self._periods(lambda i: i.legible)
 
     @property
     def on_screen(self) -> Hours:
         """When it is legible on the screen where it stands."""
-        return self._periods(lambda i: i.within(self.bounds[1]) and i.on_screen >= PART)
+        return self._periods(lambda i: i.legible and i.on_screen >= PART)
 
     def _periods(self, holds: Callable[[Instant], bool]) -> Hours:
         """First and last time of each run of instants for which something holds."""
@@ -312,7 +370,7 @@ def hours_of_sun(light: Sunlight, day: date, zone: tzinfo | None) -> Hours:
 
 
 def follow_day(
-    follower: Follower,
+    follower: Follower | SundialFollower,
     shines: Hours,
     keep: Callable[[Looked], T],
     progress: Callable[[str, int, int], None] = lambda what, done, whole: None,
@@ -350,7 +408,7 @@ def _between(day: Day, shines: Hours) -> list[datetime]:
     """Minutes at which light falls on the screen, and those between times of which one is as designed, or legible, only."""
     near = [(i.time, i.time) for i in day.instants if i.on_screen > 0.0]
     for a, b in pairwise(day.instants):
-        if any(a.within(bound) != b.within(bound) for bound in day.bounds):
+        if a.as_designed != b.as_designed or a.legible != b.legible:
             near.append((a.time, b.time))
     step = timedelta(minutes=STEP)
     minutes = [t for t in _every(shines, 1) if any(a - step < t < b + step if a == b else a < t < b for a, b in near)]
@@ -408,15 +466,15 @@ def write_plot(path: Path, day: Day) -> None:
     still = [np.nan if i.error is None else i.error for i in day.instants]
     error.plot(times, still, color=COLOURS[0], label="on the screen where it stands")
     error.plot(times, [i.followed for i in day.instants], color=COLOURS[1], label="on a screen that follows the picture")
-    error.axhline(day.bounds[1], color="0.4", ls="--", lw=1.0, label=f"legible: {day.bounds[1]:.3f}")
-    error.axhline(day.bounds[0], color="0.4", ls=":", lw=1.0, label=f"as designed: {day.bounds[0]:.3f}")
+    for k, (name, style) in enumerate((("as designed", ":"), ("legible", "--"))):
+        error.plot(times, [i.bounds[k] for i in day.instants], color="0.4", ls=style, lw=1.0, label=f"{name}: {day.bounds[k]:.3f}")
     error.set(ylabel="relative RMS error", yscale="log")
     error.yaxis.set_major_formatter("{x:g}")
     error.yaxis.set_minor_formatter(NullFormatter())
     for axis, colour in zip((0, 1), COLOURS[:2], strict=True):
         place.plot(times, [i.moved[axis] for i in day.instants], color=colour, label=f"along the screen's {'xy'[axis]}")
     place.set_ylabel("displacement (mm)")
-    reach = max((max(map(abs, i.moved)) for i in day.instants if i.within(day.bounds[1])), default=0.0)
+    reach = max((max(map(abs, i.moved)) for i in day.instants if i.legible), default=0.0)
     if reach:
         place.set_ylim(-1.5 * reach, 1.5 * reach)
     light.plot(times, [i.brightness for i in day.instants], color=COLOURS[0], label="power on the picture, over that of the design")

@@ -79,7 +79,8 @@ class WaveTrials(Trials):
         kept = {key: v for key, v in values.items() if key[0] in WAVED}
         errors, which = Misalignment.of(kept), self.tolerances.surface if number is not None else ()
         scene = errors.scene(self.scene)
-        scene = replace(scene, screen=replace(scene.screen, z=scene.screen.z + errors.throw))
+        screen, (x, y, z) = scene.screen, errors.away(scene)
+        scene = replace(scene, screen=replace(screen, z=screen.z + z, shift=(screen.shift[0] + x, screen.shift[1] + y)))
         surface = self.surface(number % REALISED, which) if which and number is not None else 0.0
         own = self._coloured(self.waves(scene, self.field, self.heights + errors.thickness + surface))
         return self.evaluate(kept, number), self.figures_of(own, own)

@@ -17,6 +17,7 @@ same; and if M correlates best with R in its own orientation.
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -64,7 +65,6 @@ VERIFICATION = Capability(
             ("ray file", "several sources", "user-defined source"),
             "⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}",
         ),
-        "tilted light": "⟨verify⟩ mitsuba traces plane waves along the axis, not tilted ones",
         "approximate Fresnel": "⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}",
     },
 )
@@ -123,7 +123,8 @@ def verify(paths: Sequence[Path], scene: Scene, field: HeightField, heights: Ten
     )
     if not (renders.sum() > 0 and image.sum() > 0):
         raise CausticError("no light reaches the screen, so there is nothing to verify")
-    shift = TURN * abs(scene.screen.z - scene.lens.z_in) / min(scene.screen.pixel)
+    throw = math.hypot(*scene.screen.shift, scene.screen.z - scene.lens.z_in)
+    shift = TURN * throw / min(scene.screen.pixel)
     return compare(renders, image, squares, rays, shift, {"mitsuba": mi.__version__, "variant": variant})
 
 

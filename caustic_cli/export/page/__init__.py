@@ -21,6 +21,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import resources
+from operator import mul
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +82,6 @@ PAGE = Capability(
         "two sides": "⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form",
         "ray file": FILE,
         "ray file among sources": FILE,
-        "tilted light": "⟨html⟩: the page traces plane waves along the axis, not tilted ones",
     },
 )
 
@@ -119,7 +119,7 @@ def write_page(
     data = {
         "title": title,
         "lens": _lens(scene.lens),
-        "screen": _screen(screen),
+        "screen": _screen(replace(scene, screen=screen)),
         "lights": _lights(scene),
         "encoding": encoding,
         "target": None if target is None else _coded(_onto(target, screen)),
@@ -154,14 +154,19 @@ def _lens(lens: Lens) -> dict:
     }
 
 
-def _screen(screen: Screen) -> dict:
-    """The screen, with its lowest corner and its axes."""
+def _screen(scene: Scene) -> dict:
+    """The screen: x, y and z of its centre, the light's way along x and y for each mm along z, by which it moves with its distance,
+    its lowest corner from the centre, its axes, and whether its normal is along the light."""
+    screen, (x, y, z) = scene.screen, scene.undeviated
     return {
         "z": screen.z,
-        "low": list(screen.low),
+        "centre": list(screen.centre[:2]),
+        "along": [x / z, y / z],
+        "low": [-half for half in screen.half_size],
         "pixel": list(screen.pixel),
         "resolution": list(screen.resolution),
         "axes": [list(axis) for axis in screen.axes],
+        "facing": sum(map(mul, scene.undeviated, screen.axes[2])) > 0,
     }
 
 
@@ -254,11 +259,12 @@ def _lights(scene: Scene) -> list[dict]:
 
 
 def _source(scene: Scene, source: Source) -> dict:
-    """Positions relative to the centre of the entrance, mm, with their weights; half sizes; the cone and i(theta) as a function of
-    s."""
+    """Positions relative to the centre of the entrance, mm, with their weights; half sizes; the axis of light from infinity; the
+    cone and i(theta) as a function of s."""
     if source.distant:
         wide = math.sin(source.half_angle)
-        return {"near": False, "places": [[0.0, 0.0, 0.0, 1.0]], "extent": [wide, wide], "picture": _picture(source)}
+        light = {"extent": [wide, wide], "axis": list(source.axis), "picture": _picture(source)}
+        return {"near": False, "places": [[0.0, 0.0, 0.0, 1.0]], **light}
     (places, parts), lens = source.points(), scene.lens
     if len(places) > PLACES:
         kept = np.linspace(0, len(places) - 1, PLACES).round().astype(int)

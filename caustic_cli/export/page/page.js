@@ -56,11 +56,13 @@ async function unpacked() {
 
 // ---- the light: beams for a setting of the controls
 
+/** The rotation that takes +z to a unit vector, as rows. */
+const rotation = ([a, b, c]) => [[1 - (a * a) / (1 + c), (-a * b) / (1 + c), a], [(-a * b) / (1 + c), 1 - (b * b) / (1 + c), b], [-a, -b, c]];
+
 /** The rotation that takes +z to light leaning by angles along x and y, as rows. */
 function leaning(leanX, leanY) {
   const p = Math.tan((leanX * Math.PI) / 180), q = Math.tan((leanY * Math.PI) / 180), length = Math.hypot(p, q, 1);
-  const a = p / length, b = q / length, c = 1 / length;
-  return [[1 - (a * a) / (1 + c), (-a * b) / (1 + c), a], [(-a * b) / (1 + c), 1 - (b * b) / (1 + c), b], [-a, -b, c]];
+  return rotation([p / length, q / length, 1 / length]);
 }
 
 const turned = (rows, v) => rows.map((row) => row[0] * v[0] + row[1] * v[1] + row[2] * v[2]);
@@ -85,30 +87,39 @@ function extentOf(light, size) {
   return own > 0 ? light.extent.map((e) => (wide * e) / own) : [wide, wide];
 }
 
+/** Directions of light from infinity at points of its disc, each with the part of its radiance that the aperture receives. */
+function directions(light, rows, extent, points) {
+  const own = rotation(light.axis), axis = turned(rows, light.axis);
+  const found = points.map(([u, v]) => {
+    const sx = extent[0] * u, sy = extent[1] * v, across = Math.sqrt(1 - sx * sx - sy * sy);
+    const [ax, ay, az] = turned(rows, turned(own, [sx, sy, across]));
+    return { ax, ay, part: az / (across * axis[2]) };
+  });
+  const mean = found.reduce((whole, one) => whole + one.part, 0) / found.length;
+  return found.map(({ ax, ay, part }) => ({ ax, ay, part: part / mean }));
+}
+
 /** Beams of a setting {z, leanX, leanY, size}; at most `most` of them for each place, if given. */
 function beamsOf(setting, most = MOST_BEAMS) {
   const rows = leaning(setting.leanX, setting.leanY), beams = [];
   const area = held.lens.size[0] * held.lens.size[1] * (held.lens.round ? Math.PI / 4 : 1), { pixel } = held.screen;
   for (const light of held.lights) {
     const extent = extentOf(light, setting.size), places = light.places.length;
-    const far = Math.abs(setting.z - held.lens.zIn);
+    const far = Math.abs(setting.z - held.lens.zIn) / (light.near ? 1 : light.axis[2]);
     const blur = Math.max(...extent.map((e, k) => ((2 * e) / pixel[k]) * (light.near ? far / Math.abs(light.places[0][2]) : far)));
     let count = blur < 0.2 ? 1 : Math.min(Math.max(8, Math.ceil(BLUR * blur * blur)), Math.ceil(most / Math.sqrt(places)));
     if (light.picture && count > 1) count = Math.min(most, light.picture.length);
     light.places.forEach(([x, y, z, part], place) => {
-      for (const [u, v] of spots(light, count, places, place)) {
+      const points = spots(light, count, places, place), from = light.near ? [] : directions(light, rows, extent, points);
+      points.forEach(([u, v], k) => {
         for (const [n, of, colour] of light.indices) {
           const power = (light.weight * part * of) / count;
           if (light.near) {
             const [x0, y0, z0] = turned(rows, [x + extent[0] * u, y + extent[1] * v, z]);
             beams.push({ near: true, x0, y0, h: -z0, n, power, axis: rows.map((row) => row[2]), light, colour });
-          } else {
-            const sx = extent[0] * u, sy = extent[1] * v;
-            const [ax, ay] = turned(rows, [sx, sy, Math.sqrt(1 - sx * sx - sy * sy)]);
-            beams.push({ near: false, ax, ay, n, power: power / area, light, colour });
-          }
+          } else beams.push({ near: false, ax: from[k].ax, ay: from[k].ay, n, power: (power * from[k].part) / area, light, colour });
         }
-      }
+      });
     });
   }
   return beams;
@@ -140,10 +151,13 @@ function intensity(beam, ax, ay, az) {
   return light.intensity[k] + (at - k) * (light.intensity[k + 1] - light.intensity[k]);
 }
 
+/** x and y of the screen's centre where that is at z: it moves along the light. */
+const centreAt = (z) => held.screen.centre.map((c, k) => c + (z - held.screen.z) * held.screen.along[k]);
+
 /** Trace the corners of row i of the grid, every `thin`-th point, into `row`. */
 function traceRow(cloud, beam, z, i, thin, row) {
   const { lens, screen } = held, { ny } = cloud, { n, near, x0, y0, h } = beam, [rx, ry] = lens.size.map((s) => s / 2);
-  const [[ux, uy, uz], [vx, vy, vz], [nx, nyy, nz]] = screen.axes;
+  const [[ux, uy, uz], [vx, vy, vz], [nx, nyy, nz]] = screen.axes, [mx, my] = centreAt(z);
   const x = (2 * i / (cloud.nx - 1) - 1) * rx, { fresnel } = lens;
   const flat = beam.near ? 1 : reflectance(fresnel, Math.sqrt(1 - square(beam.ax) - square(beam.ay)),
     Math.sqrt(1 - square(beam.ax / n) - square(beam.ay / n)), 1 / n);
@@ -187,8 +201,8 @@ function traceRow(cloud, beam, z, i, thin, row) {
       }
       if (lens.absorption) w *= Math.exp((-lens.absorption * t) / dz);
     }
-    const way = ((z - height) * nz - x * nx - y * nyy) / (ox * nx + oy * nyy + oz * nz);
-    const qx = x + way * ox, qy = y + way * oy, qz = height + way * oz - z;
+    const way = ((z - height) * nz - (x - mx) * nx - (y - my) * nyy) / (ox * nx + oy * nyy + oz * nz);
+    const qx = x - mx + way * ox, qy = y - my + way * oy, qz = height + way * oz - z;
     row.px[b] = way > 0 ? (qx * ux + qy * uy + qz * uz - screen.low[0]) / screen.pixel[0] : NaN;
     row.py[b] = (qx * vx + qy * vy + qz * vz - screen.low[1]) / screen.pixel[1];
     row.ex[b] = ex; row.ey[b] = ey; row.w[b] = w;
@@ -250,7 +264,7 @@ const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D;
 uniform sampler2D cloud, table; uniform ivec2 points; uniform int thin;
 uniform bool near, isRound, isMirror, cut; uniform int fresnel;
-uniform vec3 origin, axis, u, v, normal; uniform vec2 direction, radius, low, pixel; uniform vec4 frame;
+uniform vec3 origin, axis, u, v, normal; uniform vec2 direction, radius, middle, low, pixel; uniform vec4 frame;
 uniform float n, power, zIn, absorption, chord, z, largest, smallest;
 flat out vec4 box; flat out float each;
 float reflectance(float c, float s, float eta) {
@@ -295,7 +309,7 @@ bool corner(ivec2 at, out vec2 landing, out vec2 entrance, out float w) {
     if (fresnel > 0) { float l = fresnel == 1 ? sqrt(norm2) : 1.0; w *= (1.0 - lost) * (1.0 - reflectance(c / l, s / l, n)); }
     if (absorption > 0.0) w *= exp(-absorption * t / d.z);
   }
-  vec3 from = vec3(xy, p.x - z);
+  vec3 from = vec3(xy - middle, p.x - z);
   float way = -dot(from, normal) / dot(o, normal); vec3 q = from + way * o;
   landing = (vec2(dot(q, u), dot(q, v)) - low) / pixel;
   return way > 0.0;
@@ -311,15 +325,15 @@ void main() {
   vec2 a, b, c, d, ea, eb, ec, ed; float wa, wb, wc, wd;
   bool lit = corner(at, a, ea, wa); lit = corner(at + ivec2(0, thin), b, eb, wb) && lit;
   lit = corner(at + ivec2(thin, 0), c, ec, wc) && lit; lit = corner(at + thin, d, ed, wd) && lit;
-  vec2 middle = 0.25 * (a + b + c + d), across = c + d - a - b, upward = b + d - a - c;
+  vec2 centre = 0.25 * (a + b + c + d), across = c + d - a - b, upward = b + d - a - c;
   vec2 sides = clamp(0.5 * sqrt(across * across + upward * upward), vec2(smallest), vec2(largest));
   vec2 g = ed - ea, f = ec - eb; float area = 0.5 * abs(g.x * f.y - f.x * g.y);
   vec2 exit = ((2.0 * vec2(at) + float(thin)) / vec2(points - 1) - 1.0) * radius;
   float share = passed(exit, 0.5 * vec2(ea.x + eb.x, ea.y + ec.y), 0.5 * vec2(ec.x + ed.x, eb.y + ed.y));
   each = 0.25 * (wa + wb + wc + wd) * share * area / (sides.x * sides.y);
-  box = vec4(middle - 0.5 * sides, middle + 0.5 * sides);
-  lit = lit && each > 0.0 && all(lessThan(abs(middle), vec2(1e6)));
-  gl_Position = lit ? vec4((middle + frame.z) / frame.xy * 2.0 - 1.0, 0.0, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
+  box = vec4(centre - 0.5 * sides, centre + 0.5 * sides);
+  lit = lit && each > 0.0 && all(lessThan(abs(centre), vec2(1e6)));
+  gl_Position = lit ? vec4((centre + frame.z) / frame.xy * 2.0 - 1.0, 0.0, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
   gl_PointSize = max(sides.x, sides.y) + 1.2; // its place is rounded to a sixteenth of a pixel on some processors
 }`;
 const FRAGMENT = `#version 300 es
@@ -375,13 +389,13 @@ function graphicsTracer(cloud, slowToo) {
   gl.uniform1f(at("zIn"), lens.zIn); gl.uniform1f(at("absorption"), lens.absorption);
   gl.uniform1f(at("smallest"), SMALLEST); gl.uniform1f(at("largest"), gl.getParameter(gl.ALIASED_POINT_SIZE_RANGE)[1] - 2);
   const told = gl.getExtension("WEBGL_debug_renderer_info"), name = told ? String(gl.getParameter(told.UNMASKED_RENDERER_WEBGL)) : "";
-  const where = Object.fromEntries(["near", "origin", "axis", "cut", "chord", "direction", "n", "power", "z", "thin"].map((key) => [key, at(key)]));
+  const where = Object.fromEntries(["near", "origin", "axis", "cut", "chord", "direction", "n", "power", "z", "middle", "thin"].map((key) => [key, at(key)]));
 
   function* traced(beams, z, thin) {
     gl.clearColor(0, 0, 0, 0); gl.clear(gl.COLOR_BUFFER_BIT);
     for (const beam of beams) {
       gl.uniform1i(where.near, beam.near); gl.uniform1f(where.n, beam.n); gl.uniform1f(where.power, beam.power);
-      gl.uniform1f(where.z, z); gl.uniform1i(where.thin, thin);
+      gl.uniform1f(where.z, z); gl.uniform2f(where.middle, ...centreAt(z)); gl.uniform1i(where.thin, thin);
       if (beam.near) {
         gl.uniform3f(where.origin, beam.x0, beam.y0, beam.h); gl.uniform3f(where.axis, ...beam.axis);
         gl.uniform1i(where.cut, beam.light.cut); gl.uniform1f(where.chord, beam.light.chord);
@@ -617,8 +631,9 @@ async function start() {
   }
   byId("controls").addEventListener("reset", () => { touched.clear(); setTimeout(() => { byId("gpu").checked = Boolean(graphics); sides(); trace(); }); });
   byId("controls").addEventListener("submit", (e) => e.preventDefault());
-  // From +z, as image files are: behind a lens' screen, and before a mirror's.
-  const views = held.lens.mirror ? ["seen from the mirror’s side", "seen from behind it"] : ["seen from behind it", "seen from the lens’ side"];
+  // From its +z, as image files are: behind a lens' screen, and before a mirror's, unless it is turned over.
+  const views = ["seen from behind it", `seen from the ${held.lens.mirror ? "mirror’s" : "lens’"} side`];
+  if (!held.screen.facing) views.reverse();
   const sides = () => {
     const other = byId("mirrored").checked;
     document.querySelector(".panels").classList.toggle("mirrored", other);

@@ -72,7 +72,7 @@ class MeasuredRays:
             at = (np.arange(self.rays) + float(chosen)) * (sums[-1] / self.rays)
             taken = order[np.searchsorted(sums, at, side="right").clip(max=len(order) - 1)]
             x, y, met, part = x[taken], y[taken], met[taken], np.full(self.rays, whole / self.rays)
-        d = source.rays.directions[met]
+        d = source.turned.directions[met]
         return tuple(torch.from_numpy(np.ascontiguousarray(c)).to(self.device) for c in (x, y, *d.T, part))
 
     @property
@@ -156,7 +156,7 @@ def irradiance(scene: Scene, x: np.ndarray, y: np.ndarray, height: float) -> np.
         return None
     source, lens = _of_file(scene.source), scene.lens
     at_x, at_y, met, part = _meeting(source, lens.pupil)
-    d, n = source.rays.directions[met], lens.inside
+    d, n = source.turned.directions[met], lens.inside
     inside = np.sqrt(1.0 - (d[:, 0] ** 2 + d[:, 1] ** 2) / (n * n))
     if lens.interior.fresnel != "none":
         part = part * (1.0 - reflectance("exact", d[:, 2], inside, 1.0 / n))

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from caustic_cli.errors import InputError
 from caustic_cli.scene.aperture import Pupil
+from caustic_cli.scene.screen import tilted
 from caustic_cli.scene.sources.base import Source
+from caustic_cli.scene.sources.plane import direction
 from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.section import DISTANCE, SourceType, Table, content, positions
-from caustic_cli.schema.table import check_all
+from caustic_cli.schema.table import check_all, default
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,22 +27,37 @@ class Measured(Source):
     Its position is the rays' point of closest approach, and its extent is their width there (`RaySet`).
     """
 
-    #: In the file's own coordinates, whose z axis is parallel to the scene's.
+    #: In the file's own coordinates, whose axes are parallel to the scene's before they are turned.
     rays: RaySet = field()
-    #: Of the origin of these coordinates, mm.
+    #: Of the origin of these coordinates, mm, before it is turned.
     position: tuple[float, float, float] = (0.0, 0.0, -50.0)
     #: Of all rays, W.
     power: float = 1.0
+    #: Rotations of the rays and of their origin about the scene's origin, see `PlaneWave`.
+    tilt: tuple[float, float] = (0.0, 0.0)
+    #: Direction that +z of the file is turned to, a unit vector.
+    axis: tuple[float, float, float] = field(init=False, default=(0.0, 0.0, 1.0))
 
     kind = "rays"
 
     def __post_init__(self):
         check_all("source", self, "position", "power")
-        _ = self.rays.forward  # raises if there is none
+        object.__setattr__(self, "axis", direction(self.tilt))
+        _ = self.turned.forward  # raises if there is none
+
+    @cached_property
+    def turned(self) -> RaySet:
+        """The rays along the scene's axes, from `origin`."""
+        return self.rays.turned(tilted(self.tilt)) if any(self.tilt) else self.rays
+
+    @cached_property
+    def origin(self) -> np.ndarray:
+        """The origin of the rays' coordinates in the scene, (3,) mm."""
+        return np.array(self.position) @ np.array(tilted(self.tilt))
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """The point of closest approach."""
-        return (self.rays.focus + self.position)[None, :], np.ones(1)
+        return (self.turned.focus + self.origin)[None, :], np.ones(1)
 
     def batch(self, k: int, of: int) -> Source:
         """As of a source: a random partition of the rays."""
@@ -48,12 +66,12 @@ class Measured(Source):
     @property
     def extent(self) -> tuple[float, float]:
         """Half widths of the rays there, mm."""
-        return self.rays.spread
+        return self.turned.spread
 
     @property
     def nearest(self) -> float:
         """Largest z at which a ray starts, mm."""
-        return self.rays.nearest + self.position[2]
+        return self.turned.nearest + float(self.origin[2])
 
     @property
     def sharp(self) -> bool:
@@ -85,19 +103,23 @@ class Measured(Source):
         """As of a source, from the point of closest approach."""
         return 2.0 * math.degrees(math.atan2(self._width() / 2.0, abs(z_in - self.centre[2])))
 
+    def cone_over(self, pupil: Pupil) -> float:
+        """As of a source, about +z: what covers the pupil from the point of closest approach."""
+        return self._covering(pupil)
+
     def incidence(self, pupil: Pupil) -> float:
         """As of a source: the largest angle among the rays themselves."""
-        d = self.rays.directions[self.crossing(pupil)[2]]
+        d = self.turned.directions[self.crossing(pupil)[2]]
         return float(np.arctan2(np.hypot(d[:, 0], d[:, 1]), d[:, 2]).max(initial=0.0))
 
     def crossing(self, pupil: Pupil) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Intersections x, y (N,) mm of the rays with the plane of a pupil, and which rays carry light through it, (N,)."""
-        p, d = self.rays.positions, self.rays.directions
+        (p, d), o = (self.turned.positions, self.turned.directions), self.origin
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # rays along the plane, which carry nothing
-            way = (pupil.z - self.position[2] - p[:, 2]) / d[:, 2]
-            x, y = (p[:, k] + self.position[k] + way * d[:, k] for k in (0, 1))
+            way = (pupil.z - o[2] - p[:, 2]) / d[:, 2]
+            x, y = (p[:, k] + o[k] + way * d[:, k] for k in (0, 1))
             inside = pupil.aperture.contains(x, y)
-        return x, y, inside & (self.rays.forward > 0)
+        return x, y, inside & (self.turned.forward > 0)
 
 
 def _build(table: Table, _profile) -> Measured:
@@ -109,11 +131,11 @@ def _build(table: Table, _profile) -> Measured:
         )
     if len(places) != 1:
         raise InputError(f"⟨source.position⟩ of a ray file is that of its origin, one [x, y, z], got {len(places)}")
-    return Measured(rays, places[0], table["power"])
+    return Measured(rays, places[0], table["power"], tuple(table.get("tilt") or default("source.tilt")))
 
 
 def _position_defaults(lens: Table) -> dict[str, Any]:
     return {"position": [[0.0, 0.0, lens["z_in"] - DISTANCE * max(lens["size"])]]}
 
 
-TYPES = (SourceType("rays", "rays (of a file)", ("position", "file"), _build, _position_defaults),)
+TYPES = (SourceType("rays", "rays (of a file)", ("position", "file", "tilt"), _build, _position_defaults),)

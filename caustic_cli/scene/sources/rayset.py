@@ -10,7 +10,8 @@ Coordinates are the file's own; emission is towards its +z.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -78,6 +79,11 @@ class RaySet:
                 raise InputError(f"wavelengths must be {n}, got {wavelengths.shape}")
             _refuse(~((wavelengths >= SHORTEST) & (wavelengths <= LONGEST)), f"a wavelength outside {SHORTEST:g} to {LONGEST:g} nm")
             object.__setattr__(self, "wavelengths", wavelengths)
+
+    def turned(self, axes: Sequence[Sequence[float]] | np.ndarray) -> RaySet:
+        """The rays after the rotation about the origin that takes x, y and z to these unit vectors."""
+        positions, directions = (a @ np.asarray(axes) for a in (self.positions, self.directions))
+        return replace(self, positions=positions, directions=directions)
 
     @property
     def count(self) -> int:

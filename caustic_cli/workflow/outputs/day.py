@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from datetime import date
 from typing import Any, ClassVar
 
+import numpy as np
 from PIL import Image, ImageDraw
 
-from caustic_cli.config.optional import sunlight
+from caustic_cli.config.optional import in_reading_order, sunlight
 from caustic_cli.errors import InputError
 from caustic_cli.io.movie import write_movie
 from caustic_cli.io.picture import codes_of
-from caustic_cli.scene.sunlight import Hours, Sunlight, moment
+from caustic_cli.scene import Scene
+from caustic_cli.scene.sunlight import Hours, Sunlight, instants, moment
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies import day as study
 from caustic_cli.studies.retrace import white_level
@@ -66,19 +68,9 @@ class DayOfSunlight(Output):
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """day: the figures of `studies.day`, with the paths of both files."""
-        lens, plan, say, (film, plot) = rendering.lens, rendering.plan, rendering.say, self.paths(rendering.place)
-        assert lens.target is not None
+        lens, say, (film, plot) = rendering.lens, rendering.say, self.paths(rendering.place)
         light, shines = self._sunlight(rendering)
-        follower = study.Follower(
-            plan.scene,
-            lens.field,
-            lens.heights,
-            lens.target,
-            light,
-            rays=rendering.asked.tracing.rays or study.RAYS,
-            seed=rendering.seed,
-            device=rendering.device,
-        )
+        follower = self._follower(rendering, light)
         with say.progress(None) as show:
             found, frames = study.follow_day(
                 follower,
@@ -90,14 +82,40 @@ class DayOfSunlight(Output):
         study.write_plot(plot, found)
         return {"day": found.figures | {"film": str(film), "plot": str(plot)}}
 
+    def _follower(self, rendering: Rendering, light: Sunlight) -> study.Follower | study.SundialFollower:
+        """Of the picture, or of each picture of a sundial.
+
+        Raises:
+            InputError: its sources are not the sun at several times.
+        """
+        lens, scene, project = rendering.lens, rendering.plan.scene, rendering.lens.project
+        assert lens.target is not None and project is not None
+        rays = rendering.asked.tracing.rays or study.RAYS
+
+        def follower(one: Scene, target: np.ndarray) -> study.Follower:
+            how = {"rays": rays, "seed": rendering.seed, "device": rendering.device}
+            return study.Follower(one, lens.field, lens.heights, target, light, **how)
+
+        if not scene.source.in_turn:
+            return follower(scene, lens.target)
+        room = project.room(rendering.asked.tracing.given)
+        assert room is not None
+        times, targets = instants(room.time, len(scene.by_source)), project.targets(scene)
+        if not len(times) == len(targets) == len(scene.by_source):
+            raise InputError("⟨day⟩ of sources that shine in turn needs ⟨room.time⟩ as an interval and a picture for each of them")
+        followers = [follower(*pair) for pair in zip(scene.by_source, targets, strict=True)]
+        return study.SundialFollower(followers, in_reading_order(times, scene.lens.array))
+
     def show(self, figures: dict[str, Any], say: Reporter) -> None:
         found = figures["day"]
         say.table(f"the sun on {self.day}", [*study.rows(found), ("film and plot", f"{found['film']}, {found['plot']}")])
 
 
-def _frame(follower: study.Follower, encoding: str, seen: study.Looked) -> Image.Image:
+def _frame(followed: study.Follower | study.SundialFollower, encoding: str, seen: study.Looked) -> Image.Image:
     """The plane of the screen, with the outline of the screen, beside the picture that is followed."""
-    scene, i = follower.scene, seen.instant
+    i = seen.instant
+    follower = followed.of(i.time)
+    scene = follower.scene
     white = white_level(follower.white, follower.target)
     shown = []
     for image in (seen.around, seen.image):
@@ -114,7 +132,7 @@ def _frame(follower: study.Follower, encoding: str, seen: study.Looked) -> Image
     both = Image.new("RGB", (wall.width + 8 + picture.width, HEIGHT), (40, 40, 40))
     both.paste(wall, (0, 0))
     both.paste(picture, (wall.width + 8, 0))
-    legible = "" if i.within(follower.bounds[1]) else ", not legible"
+    legible = "" if i.legible else ", not legible"
     place = f"{i.moved[0]:+.1f}, {i.moved[1]:+.1f} mm"
     return captioned(
         both,
