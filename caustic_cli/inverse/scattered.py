@@ -41,9 +41,9 @@ class Scattered:
     half: tuple[float, float]
     home: np.ndarray
 
-    def envelope(self, psi: np.ndarray) -> Envelope:
+    def envelope(self, psi: np.ndarray) -> LowerHull:
         """phi of these sites at prices psi (N,), mm^2."""
-        return Envelope(psi, self)
+        return LowerHull(psi, self)
 
     def without(self, seen: np.ndarray, mass: np.ndarray) -> Scattered:
         """Those that are `seen` (N,) bool, with these masses."""
@@ -64,8 +64,8 @@ class Scattered:
 
 
 @dataclass(frozen=True, eq=False)
-class Envelope:
-    """phi of scattered sites at prices psi (N,), mm^2."""
+class LowerHull:
+    """phi of scattered sites at prices psi (N,), mm^2, by the lower convex hull of the points (y_p, psi_p)."""
 
     psi: np.ndarray
     sites: Scattered
