@@ -251,10 +251,10 @@ def test_mitsuba_agrees_on_round_lenses(tmp_path, source):
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (257, 257), dark=True)
     assert all(p.is_file() for p in companions(tmp_path / "lens.xml", scene))
     try:
-        decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, 100_000)
+        decision = verify.verify([tmp_path / "lens.xml"], scene, field, heights, 100_000)
     except CausticError as error:
         pytest.skip(str(error))
     assert decision.agree, decision.figures
     square = replace(scene, lens=replace(scene.lens, aperture="rectangle"))
     if not isinstance(source, PlaneWave):
-        assert not verify.verify(tmp_path / "lens.xml", square, field, heights, 100_000).agree
+        assert not verify.verify([tmp_path / "lens.xml"], square, field, heights, 100_000).agree
