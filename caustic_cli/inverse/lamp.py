@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.effort import STANDARD, Effort
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.inverse.parametrisation import InverseLaplacian
@@ -35,26 +35,8 @@ from caustic_cli.scene.lamp import Goal, Lamp
 MARGIN = 0.005
 #: Dark pixels around the target on which light beside it is seen; and the filter of the image.
 APRON, FILTER = 4, Filter("cosine", (3, 3))
-#: Control values along both axes, and degree.  At degree 3 the edge of the target ripples more: 0.078 against 0.019 over all pixels
-#: of 120 x 40 degrees.
-CONTROL, DEGREE = 48, 5
-
-
-@dataclass(frozen=True)
-class LampStage:
-    """A stage of the refinement.
-
-    pixels: about, on the whole target; rays: about; iterations: at most; weight: w, see the module.
-    """
-
-    pixels: int
-    rays: int
-    iterations: int
-    weight: float
-
-
-#: 30 x 10 m from 8 m, relative RMS over pixels of half the size: 0.019 after the second, 0.013 after the third.
-STAGES = (LampStage(800, 100_000, 60, 0.1), LampStage(3_000, 200_000, 100, 0.03), LampStage(10_800, 300_000, 150, 0.01))
+#: Degree of the spline.
+DEGREE = 3
 
 
 def pixels_of(goal: Goal, count: int) -> tuple[int, int]:
@@ -164,37 +146,39 @@ def initial_lamp(lamp: Lamp, goal: Goal, field: PolarField, picture: np.ndarray,
     return transported(field, directions_of(goal, pixels)[lit], power[lit], lamp.index, lamp.radius, cells)
 
 
+def field_of(effort: Effort) -> PolarField:
+    """The spline spaces of a design."""
+    return PolarField.uniform((effort.lamp_control,) * 2, (DEGREE,) * 2)
+
+
 def design_lamp(
     lamp: Lamp,
     goal: Goal,
     picture: np.ndarray,
     *,
-    stages: Sequence[LampStage] = STAGES,
-    field: PolarField | None = None,
-    cells: int = CELLS,
+    effort: Effort = STANDARD,
     seed: int = 0,
     on_iteration: Callable[[int, int, float], None] = lambda stage, k, loss: None,
-) -> tuple[PolarField, Tensor]:
-    """The free-form surface that sends the light of a chip to a picture: its spline spaces and control values of log r, r in mm.
+) -> Tensor:
+    """The surface that sends the light of a chip to a picture: control values of log r, r in mm, over the spline spaces `field_of`.
 
     Args:
         picture: as of `wanted`.
-        stages, cells: of the refinement, and of the transport, see `initial_lamp`.
         seed: of a chip's rays.
         on_iteration: called with the number of the stage, that of iterations in it and the loss.
 
     Raises:
         InputError: the picture is black, or the surface comes too near to the hemisphere.
     """
-    field = field or PolarField.uniform((CONTROL, CONTROL), (DEGREE, DEGREE))
-    values = initial_lamp(lamp, goal, field, picture, cells)
+    field = field_of(effort)
+    values = initial_lamp(lamp, goal, field, picture, effort.lamp_cells)
     refuse_thin(lamp, field, values)
-    for k, stage in enumerate(stages):
-        target = wanted(goal, picture, pixels_of(goal, stage.pixels))
-        objective = LampObjective(lamp, goal, field, target, stage.rays, stream(seed, f"stage {k}"), stage.weight)
-        values = refine(objective, values, stage.iterations, partial(on_iteration, k))
+    for k, (pixels, rays, iterations, weight) in enumerate(effort.lamp_stages):
+        target = wanted(goal, picture, pixels_of(goal, pixels))
+        objective = LampObjective(lamp, goal, field, target, rays, stream(seed, f"stage {k}"), weight)
+        values = refine(objective, values, iterations, partial(on_iteration, k))
     refuse_thin(lamp, field, values)
-    return field, values
+    return values
 
 
 def refuse_thin(lamp: Lamp, field: PolarField, values: Tensor) -> None:
@@ -208,5 +192,6 @@ def refuse_thin(lamp: Lamp, field: PolarField, values: Tensor) -> None:
         needed = lamp.radius * (lamp.inner + lamp.wall) / least
         raise InputError(
             f"the free-form surface comes within {least - lamp.inner:.3g} mm of the hemisphere of {lamp.inner:g} mm, and the wall"
-            f" must be {lamp.wall:g} mm: give a radius of {math.ceil(10.1 * needed) / 10:g} mm or more, or a smaller inner radius"
+            f" must be {lamp.wall:g} mm: ⟨lamp.radius⟩ of {math.ceil(10.1 * needed) / 10:g} mm or more, or a smaller ⟨+lamp.inner⟩,"
+            " is needed"
         )

@@ -39,7 +39,7 @@ def new_project(
     Raises:
         InputError: invalid input.
     """
-    said = _merged(given, preset, config, say)
+    said = merged(given, preset, config, say)
     parameters = Parameters(said.pop("", {}))
     if parameters.elements is not None:  # those of the command line replace those of a configuration
         said["element"] = {"list": list(parameters.elements)}
@@ -54,6 +54,9 @@ def new_project(
             raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
         said["source"] = colours.filled(said.get("source", {}), picture)
     full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
+    if full.lamp is not None:
+        full = _with_picture(full, picture)
+        return Project(out, full, picture, uptodate.digest(full, picture)), said
     for key in ("index_range", "index_control", "index_layers"):
         if f"lens.{key}" in given and full.lens.gradient != "free":
             raise InputError(f"⟨lens.{key}⟩ belongs to ⟨+lens.gradient⟩ free")
@@ -64,13 +67,20 @@ def new_project(
     settings.refuse_unused(full.source, given, [stage.source for stage in full.design.stages])
     if goal.color and (beyond := colours.beyond_words(picture, settings.build_light(full))):
         say(beyond)
-    full = full.changed(target=full.target.changed(file=f"target{picture.suffix}", encoding=picture.encoding))
+    full = _with_picture(full, picture)
     full = attachments.named_in_project(full)
     asked = uptodate.digest(full, picture)
     return Project(out, full, picture, asked, without_waves=without_waves(full, "stages" in said.get("design", {}))), said
 
 
-def _merged(given: Mapping[str, Any], preset: str | None, config: Path | None, say: Callable[[str], None]) -> Given:
+def _with_picture(full: Settings, picture: Picture) -> Settings:
+    """Settings that name the picture's file in the project."""
+    return full.changed(target=full.target.changed(file=f"target{picture.suffix}", encoding=picture.encoding))
+
+
+def merged(
+    given: Mapping[str, Any], preset: str | None, config: Path | None, say: Callable[[str], None] = lambda text: None
+) -> Given:
     """The settings of preset, configuration and command line, with the contents of the files they name."""
     layers = [settings.read(presets.path_of(preset), parameters=True)] if preset else []
     if config:

@@ -108,15 +108,15 @@ class Lamp:
 
     def __post_init__(self):
         if not 1.0 < self.index <= 5.0:
-            raise InputError(f"the refractive index of a lamp must be greater than 1 and at most 5, got {self.index!r}")
+            raise InputError(f"⟨lens.index⟩ of a lamp must be greater than 1 and at most 5, got {self.index!r}")
         if not self.chip.reach < self.inner < math.inf:
             raise InputError(
-                f"the inner radius must be greater than that of the chip, {self.chip.reach:g} mm, got {self.inner!r} mm"
+                f"⟨lamp.inner⟩ must be greater than the radius of the chip, {self.chip.reach:g} mm, got {self.inner:g} mm"
             )
         if not (self.wall > 0 and self.inner + self.wall < self.radius < math.inf):
             raise InputError(
-                f"the radius must be greater than that of the hemisphere and a wall, {self.inner + self.wall:g} mm,"
-                f" got {self.radius!r} mm"
+                f"⟨lamp.radius⟩ must be greater than ⟨+lamp.inner⟩ and ⟨+lamp.wall⟩ together, {self.inner + self.wall:g} mm, got"
+                f" {self.radius:g} mm"
             )
 
     @property
