@@ -11,7 +11,7 @@ from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lamp import LampObjective, design_lamp, directions_of, field_of, pixels_of, wanted
 from caustic_cli.inverse.refractor_transport import envelope, source_directions
-from caustic_cli.optics.lamp import PointGrid, emit, land, through, through_point
+from caustic_cli.optics.lamp import PointGrid, emissions, land, through, through_point
 from caustic_cli.optics.surfaces.polarfield import PolarField, direction_of, frame, stereographic
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.studies.lamp import lamp_figures
@@ -28,6 +28,12 @@ def bumpy(field=FIELD, radius=12.0, height=0.05, seed=0):
 
 def random(*shape, seed=1):
     return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def emit(chip, count, seed):
+    """The rays of a chip, fewer than are emitted at a time."""
+    (rays,) = emissions(chip, count, seed)
+    return rays
 
 
 # Geometry
@@ -113,6 +119,14 @@ def test_a_lambertian_chip_emits_by_the_cosine_from_its_whole_area(chip):
     for c, square in zip((x, y), squares, strict=True):
         assert float((c * c).mean()) == pytest.approx(square, abs=2e-3)
     assert float((x * dx).mean()) == pytest.approx(0.0, abs=5e-3)
+
+
+@pytest.mark.parametrize("chip", [Chip(), Chip("disc", (4.0, 4.0))])
+def test_many_rays_are_emitted_some_at_a_time(chip):
+    parts = list(emissions(chip, 300_000, 1))
+    assert len(parts) == 3 and max(len(part.power) for part in parts) == 1 << 17
+    assert sum(float(part.power.sum()) for part in parts) == pytest.approx(1.0, abs=1e-12)
+    assert sum(float((part.power * part.direction[2]).sum()) for part in parts) == pytest.approx(2.0 / 3.0, abs=1e-4)
 
 
 @pytest.mark.parametrize("chip", [Chip(), Chip("disc", (4.0, 4.0)), Chip("rectangle", (5.0, 3.0))])

@@ -37,6 +37,8 @@ def road(tmp_path_factory):
 
 
 def figures_of(capfd, *arguments):
+    """The figures that a command prints."""
+    capfd.readouterr()
     assert cli.run([*arguments, "--json", "--quiet"]) == 0
     return json.loads(capfd.readouterr().out)
 
@@ -106,6 +108,24 @@ def test_a_chip_of_any_shape_is_designed_for(capfd):
         assert (chip.shape, chip.size) == (shape, (1.0, 0.5))
 
 
+@pytest.mark.parametrize("flip", ["", "x", "y", "xy"])
+def test_the_light_lies_as_the_picture_says(flip, capfd):
+    picture = np.zeros((8, 8))
+    picture[1:5, 1:7], picture[5:7, 1:3] = 1.0, 3.0  # an L, of two shades
+    np.save("l.npy", picture)
+    more = ["--flip", flip] if flip else []
+    assert cli.run(["design", "l.npy", *ROAD[:4], "--picture-size", "14m", "--lamp-inner", "3", *more, "-o", "l", "--quiet"]) == 0
+    figures = figures_of(capfd, "render", "l", "--rays", "100000", "-o", "l.png", "--npy", "seen.npy")
+    assert figures["uniformity"] is None and figures["of_source"] > 0.7
+    turned = picture[::-1] if "x" in flip else picture
+    turned = turned[:, ::-1] if "y" in flip else turned
+    n = len(np.load("seen.npy"))
+    at = (np.arange(n) + 0.5) / n * 8
+    wanted = turned[np.ix_(at.astype(int), at.astype(int))]
+    fits = [np.corrcoef(t.ravel(), np.load("seen.npy").ravel())[0, 1] for t in (wanted, wanted[::-1], wanted[:, ::-1], wanted.T)]
+    assert fits[0] > 0.7 and fits[0] > max(fits[1:]) + 0.1
+
+
 def test_an_edited_project_is_rendered_as_it_says(road, capfd):
     text = (road / "project.toml").read_text()
     assert "chip = [0.0, 0.0]" in text and "[source]" not in text
@@ -116,6 +136,27 @@ def test_an_edited_project_is_rendered_as_it_says(road, capfd):
     (other / "project.toml").write_text(text.replace("chip = [0.0, 0.0]", "chip = [2.0, 2.0]"))
     one, two = (figures_of(capfd, "render", str(p), "--rays", "40000", "-o", f"{p.stem}.png") for p in (road, other))
     assert two["of_source"] < one["of_source"]  # a wider chip
+
+
+def test_a_project_edited_beyond_its_lens_is_refused(road, capfd):
+    other = road.parent / "thin.caustic"
+    other.mkdir()
+    for file in road.iterdir():
+        (other / file.name).write_bytes(file.read_bytes())
+    text = (road / "project.toml").read_text()
+    for old, new, words in (
+        ("inner = 4.0", "inner = 9.0", "the free-form surface comes within"),
+        ("radius = 15.0", "radius = -1.0", "radius must be"),
+        ("radius = 15.0", "radius = nan", "radius must be a number"),
+        ("chip = [0.0, 0.0]", "chip = [0.0, 1.0]", "two sizes above 0 mm"),
+        ("chip = [0.0, 0.0]", "chop = [0.0, 0.0]", "is not a key; did you mean chip"),
+        ("[screen]", "[screen]\ntilt = [0.0, 10.0]", "tilt is not a setting of a lamp"),
+        ("size = [30000.0", "size = [0.0", "size"),
+    ):
+        assert old in text
+        (other / "project.toml").write_text(text.replace(old, new))
+        assert words in refused(capfd, "render", str(other), "-o", "x.png"), old
+    assert not Path("x.png").exists()
 
 
 # Refusals
@@ -141,6 +182,8 @@ def test_an_edited_project_is_rendered_as_it_says(road, capfd):
         (["--lamp", "15", "--angles", "60", "--movie", "a.gif"], "--movie is for a lens before its light"),
         (["--lamp", "15", "--angles", "60", "--error", "0.1"], "--error is for a lens before its light"),
         (["--lamp", "15", "--angles", "60", "--plan"], "--plan is for a lens before its light"),
+        (["--lamp", "15", "--angles", "60", "--device", "cuda"], "cuda"),
+        (["--lamp", "15", "--angles", "60", "--dtype", "float32"], "--dtype is not a setting of a lamp"),
         (["--chip", "1"], "--chip belongs to a lamp, which --lamp makes"),
         (["--angles", "60"], "--angles belongs to a lamp"),
         (["--lamp", "15", "--picture-size", "3m", "--throw", "-1m"], "distance"),

@@ -134,6 +134,8 @@ def _design_lamp(asked: DesignOptions, picture: Any, path: Path) -> None:
 
     if checks.rank_and_size()[1] > 1:
         raise InputError("a lamp is designed by one process, and torchrun has started more")
+    if asked.device == "cuda":
+        raise InputError("a lamp is designed on the CPU: leave out --device cuda")
     for name in ("movie", "error", "plan"):
         if getattr(asked, name):
             raise InputError(f"--{name} is for a lens before its light, not for a lamp around it")

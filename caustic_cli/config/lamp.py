@@ -29,7 +29,7 @@ TAKEN = {
     "lens": ("index", "glass", "wavelength"),
     "screen": ("z",),
     "target": ("file", "size", "encoding", "flip"),
-    "design": ("seed", "start", "dtype"),
+    "design": ("seed", "start"),
 }
 PARAMETERS = ("throw", "picture_size", "screen_place", "invert")
 

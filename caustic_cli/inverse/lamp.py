@@ -24,7 +24,7 @@ from caustic_cli.inverse.parametrisation import InverseLaplacian
 from caustic_cli.inverse.refractor_transport import CELLS, transported
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.lamp import CHUNK, ChipRays, PointGrid, emit, land, through, through_point
+from caustic_cli.optics.lamp import ChipRays, PointGrid, emissions, land, through, through_point
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.polarfield import PolarField
@@ -81,7 +81,7 @@ class LampObjective:
     def __init__(self, lamp: Lamp, goal: Goal, field: PolarField, target: Tensor, rays: int, seed: int = 0, weight: float = 0.1):
         self.goal, self.weight = goal, weight
         point = lamp.chip.shape == "point"
-        self.rays: Sequence[PointGrid | ChipRays] = PointGrid.of(field, rays) if point else emit(lamp.chip, rays, seed).split(CHUNK)
+        self.rays: Sequence[PointGrid | ChipRays] = PointGrid.of(field, rays) if point else list(emissions(lamp.chip, rays, seed))
         self.through = partial(through_point, lamp) if point else partial(through, lamp, field)
         self.screen = Screen(goal.size, resolution=(target.shape[0], target.shape[1])).grown((APRON, APRON))
         smooth = FILTER.smooth(torch.nn.functional.pad(target.double(), (APRON,) * 4))

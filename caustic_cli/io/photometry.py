@@ -89,7 +89,7 @@ def write_ldt(path: Path, light: Photometry) -> None:
         "computed by ray tracing",
         light.name[:78],
         light.name[:26],
-        path.name[:8],
+        path.stem[:8],
         "not issued",
         _text(light.diameter),
         "0",  # width: round

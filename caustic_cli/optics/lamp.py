@@ -14,6 +14,7 @@ followed any further when reflected.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -50,11 +51,6 @@ class ChipRays(NamedTuple):
     direction: Vectors
     power: Tensor
 
-    def split(self, size: int) -> list[ChipRays]:
-        """The rays, `size` at a time."""
-        parts = zip(*(c.split(size) for c in (*self.origin, *self.direction, self.power)), strict=True)
-        return [ChipRays((x, y, z), (dx, dy, dz), power) for x, y, z, dx, dy, dz, power in parts]
-
 
 class LampLight(NamedTuple):
     """Light behind the lens.
@@ -81,19 +77,22 @@ def concentric(s: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     return r * torch.cos(angle), r * torch.sin(angle)
 
 
-def emit(chip: Chip, count: int, seed: int) -> ChipRays:
-    """About `count` rays of equal power: stratified ones of a point, a Sobol sequence for a chip with an extent."""
-    if chip.shape == "point":
-        side = max(1, round(math.sqrt(count)))
-        s, t = numbers("stratified", (side, side), seed, 2, 0, side * side)
-        x = y = torch.zeros_like(s)
-    else:
-        s, t, k, m = numbers("sobol", (1, 1), seed, 4, 0, min(count, SOBOL_RAYS))
-        x, y = (2.0 * k - 1.0, 2.0 * m - 1.0) if chip.shape == "rectangle" else concentric(k, m)
-        x, y = 0.5 * chip.size[0] * x, 0.5 * chip.size[1] * y
-    dx, dy = concentric(s, t)
-    dz = (1.0 - dx * dx - dy * dy).clamp_min(0.0).sqrt()
-    return ChipRays((x, y, torch.zeros_like(x)), (dx, dy, dz), torch.full_like(dx, 1.0 / len(dx)))
+def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
+    """About `count` rays of equal power, CHUNK at a time: stratified ones of a point, a Sobol sequence of a wider chip."""
+    point, side = chip.shape == "point", max(1, round(math.sqrt(count)))
+    total = side * side if point else min(count, SOBOL_RAYS)
+    for start in range(0, total, CHUNK):
+        stop = min(start + CHUNK, total)
+        if point:
+            s, t = numbers("stratified", (side, side), seed, 2, start, stop)
+            x = y = torch.zeros_like(s)
+        else:
+            s, t, k, m = numbers("sobol", (1, 1), seed, 4, start, stop)
+            x, y = (2.0 * k - 1.0, 2.0 * m - 1.0) if chip.shape == "rectangle" else concentric(k, m)
+            x, y = 0.5 * chip.size[0] * x, 0.5 * chip.size[1] * y
+        dx, dy = concentric(s, t)
+        dz = (1.0 - dx * dx - dy * dy).clamp_min(0.0).sqrt()
+        yield ChipRays((x, y, torch.zeros_like(x)), (dx, dy, dz), torch.full_like(dx, 1.0 / total))
 
 
 class PointGrid:

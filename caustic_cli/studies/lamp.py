@@ -17,7 +17,7 @@ from scipy.ndimage import minimum_filter
 from torch import Tensor
 
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.lamp import CHUNK, LOSSES, LampLight, emit, land, through
+from caustic_cli.optics.lamp import LOSSES, LampLight, emissions, land, through
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.polarfield import PolarField
@@ -49,7 +49,7 @@ class LampImage(NamedTuple):
 def traced(lamp: Lamp, field: PolarField, values: Tensor, rays: int, seed: int) -> Iterator[tuple[int, LampLight]]:
     """Light behind the lens of two independent halves of about `rays` rays of sum 1 each, in parts: number of the half, light."""
     for half in (0, 1):
-        for part in emit(lamp.chip, max(1, rays // 2), stream(seed, f"lamp {half}")).split(CHUNK):
+        for part in emissions(lamp.chip, max(1, rays // 2), stream(seed, f"lamp {half}")):
             with torch.no_grad():
                 yield half, through(lamp, field, part, values)
 

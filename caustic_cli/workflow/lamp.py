@@ -25,7 +25,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import MESHES, write_lamp
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
-from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, wanted
+from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, wanted
 from caustic_cli.io.files import Piped
 from caustic_cli.io.photometry import Photometry, write_ies, write_ldt
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
@@ -73,15 +73,14 @@ class LampDesign:
             InputError: there is none, or a setting was edited out of range.
         """
         saved, s = project.load(), project.settings
-        return cls(
-            project,
-            lamp_of(s),
-            goal_of(s),
-            PolarField(saved.spaces),
-            saved.state.heights,
-            picture_of(project),
-            dict(saved.results),
-        )
+        lamp, goal, field, values = lamp_of(s), goal_of(s), PolarField(saved.spaces), saved.state.heights
+        if tuple(values.shape) != field.shape or not bool(torch.isfinite(values).all()):
+            raise project.error("holds no lamp in its checkpoint: design it again")
+        try:
+            refuse_thin(lamp, field, values)
+        except InputError as error:
+            raise project.error(f"{error}") from error
+        return cls(project, lamp, goal, field, values, picture_of(project), dict(saved.results))
 
     def image_and_figures(self, rays: int | None, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
         """Part of the light on each pixel, (n_x, n_y), and the figures of `studies.lamp`, with those of the far field; rays: None
