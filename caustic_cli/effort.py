@@ -107,6 +107,9 @@ class Effort:
         (10_800, 250_000, 150, 0.01),
         (10_800, 250_000, 150, 0.003),
     )
+    #: The same for a chip with an extent, whose rays cost ten times as much and whose blur hides what is smaller: after the first
+    #: two of the stages above, by the light of its centre.
+    chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_000, 400_000, 60, 0.005),)
     #: Control values along both axes; cells of the light along both axes for the transport.
     lamp_control: int = 64
     lamp_cells: int = 44
@@ -173,6 +176,7 @@ TEST = replace(
     lenslet_cells=32,
     vertex_cells=32,
     lamp_stages=((300, 5_000, 15, 0.1), (600, 10_000, 15, 0.02)),
+    chip_stages=((300, 10_000, 5, 0.02),),
     lamp_control=24,
     lamp_cells=16,
     final_rays=40_000,

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import brentq
 
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
@@ -166,6 +167,58 @@ def test_a_point_is_a_small_chip_and_its_grid_carries_the_same_light():
         assert mean == pytest.approx(float((one.power * one.direction[k]).sum()), abs=2e-4)
 
 
+def test_rays_are_those_of_a_textbook_tracer():
+    """Roots by SciPy, normals by differences of points, Snell and Fresnel by angles."""
+    lamp, values = Lamp(Chip("rectangle", (4.0, 3.0)), inner=4.5, radius=16.0), bumpy(height=0.25)
+    rays = emit(lamp.chip, 100, 6)
+    light = through(lamp, FIELD, rays, values)
+
+    def height(points):
+        """|P| - r(P) of points (.., 3)."""
+        x, y, z = torch.from_numpy(np.atleast_2d(points)).T
+        u, v = stereographic(x, y, z)
+        return np.linalg.norm(points, axis=-1) - np.squeeze(FIELD.at(values, u, v, [(0, 0)])[0].exp().numpy())
+
+    def normal(point, h=1e-6):
+        """The gradient of |P| - r(P), by differences."""
+        found = np.array([height(point + h * e) - height(point - h * e) for e in np.eye(3)])
+        return found / np.linalg.norm(found)
+
+    def interface(d, n, eta):
+        """Direction and transmittance beyond a surface; None in total reflection."""
+        inside = math.acos(min(1.0, float(d @ n)))
+        if eta * math.sin(inside) >= 1.0:
+            return None
+        beyond = math.asin(eta * math.sin(inside))
+        out = eta * d + (math.cos(beyond) - eta * math.cos(inside)) * n
+        if inside < 1e-9:
+            return out, 1.0 - ((1.0 - eta) / (1.0 + eta)) ** 2
+        s = math.sin(inside - beyond) / math.sin(inside + beyond)
+        p = math.tan(inside - beyond) / math.tan(inside + beyond)
+        return out, 1.0 - 0.5 * (s * s + p * p)
+
+    checked = reflected = 0
+    for k in range(len(rays.power)):
+        o, d = (np.array([float(c[k]) for c in w]) for w in (rays.origin, rays.direction))
+        t = brentq(lambda t: np.linalg.norm(o + t * d) - lamp.inner, 0.0, 20.0, xtol=1e-14)  # noqa: B023
+        o = o + t * d
+        d, power = interface(d, o / lamp.inner, 1.0 / lamp.index)
+        if d[2] <= 0 or (np.diff(height(o + np.linspace(0.0, 25.0, 500)[:, None] * d) > 0) != 0).sum() != 1:
+            continue  # more than one crossing
+        t = brentq(lambda t: float(height(o + t * d)), 0.0, 25.0, xtol=1e-13)  # noqa: B023
+        point = o + t * d
+        np.testing.assert_allclose([float(c[k]) for c in light.point], point, atol=1e-9)
+        found = interface(d, normal(point), lamp.index)
+        if found is None:
+            assert float(light.power[k]) == 0.0 and float(light.lost["total_internal_reflection"][k]) > 0.0
+            reflected += 1
+            continue
+        np.testing.assert_allclose([float(c[k]) for c in light.direction], found[0], atol=1e-5)
+        assert float(light.power[k] / rays.power[k]) == pytest.approx(power * found[1], abs=1e-4)
+        checked += 1
+    assert checked > 50 and reflected > 2
+
+
 def test_an_ellipsoid_with_the_chip_at_its_focus_sends_all_light_into_one_direction():
     """r = b / (1 - x.y / n), the stigmatic surface on which the transport rests."""
     y = torch.tensor([0.1, -0.2, 0.9], dtype=torch.float64)
@@ -264,7 +317,8 @@ def test_a_small_design_lights_its_target(goal):
 
 
 def test_a_design_is_repeated_to_the_bit():
-    effort = replace(STANDARD, lamp_stages=((100, 2000, 3, 0.1),), lamp_control=10, lamp_cells=12)
+    stages = ((100, 2000, 3, 0.1),)
+    effort = replace(STANDARD, lamp_stages=stages, chip_stages=stages, lamp_control=10, lamp_cells=12)
     chip, goal = Lamp(Chip("disc", (0.5, 0.5))), Goal((80.0, 80.0))
     one, other = (design_lamp(chip, goal, np.ones((2, 2)), effort=effort) for _ in range(2))
     assert torch.equal(one, other)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -29,7 +30,7 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene import Screen
-from caustic_cli.scene.lamp import Goal, Lamp
+from caustic_cli.scene.lamp import Chip, Goal, Lamp
 
 #: Squared cosine of the angle of exit below which a ray is near total reflection.
 MARGIN = 0.005
@@ -151,6 +152,13 @@ def field_of(effort: Effort) -> PolarField:
     return PolarField.uniform((effort.lamp_control,) * 2, (DEGREE,) * 2)
 
 
+def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Chip, tuple[int, int, int, float]]]:
+    """The stages of a design, each with the chip whose light it follows: that of the lamp, or a point at its centre."""
+    if lamp.chip.shape == "point":
+        return [(lamp.chip, stage) for stage in effort.lamp_stages]
+    return [(Chip(), stage) for stage in effort.lamp_stages[:2]] + [(lamp.chip, stage) for stage in effort.chip_stages]
+
+
 def design_lamp(
     lamp: Lamp,
     goal: Goal,
@@ -173,9 +181,10 @@ def design_lamp(
     field = field_of(effort)
     values = initial_lamp(lamp, goal, field, picture, effort.lamp_cells)
     refuse_thin(lamp, field, values)
-    for k, (pixels, rays, iterations, weight) in enumerate(effort.lamp_stages):
+    for k, (chip, (pixels, rays, iterations, weight)) in enumerate(stages_of(lamp, effort)):
         target = wanted(goal, picture, pixels_of(goal, pixels))
-        objective = LampObjective(lamp, goal, field, target, rays, stream(seed, f"stage {k}"), weight)
+        lit = replace(lamp, chip=chip)
+        objective = LampObjective(lit, goal, field, target, rays, stream(seed, f"stage {k}"), weight)
         values = refine(objective, values, iterations, partial(on_iteration, k))
     refuse_thin(lamp, field, values)
     return values

@@ -25,7 +25,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import MESHES, write_lamp
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
-from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, wanted
+from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, stages_of, wanted
 from caustic_cli.io.files import Piped
 from caustic_cli.io.photometry import Photometry, write_ies, write_ldt
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
@@ -136,7 +136,8 @@ def design(
     lamp, goal, picture = lamp_of(s), goal_of(s), picture_of(project)
     for words in notes(lamp, goal):
         say.say(words)
-    last, total = len(effort.lamp_stages), sum(stage[2] for stage in effort.lamp_stages)
+    stages = stages_of(lamp, effort)
+    last, total = len(stages), sum(iterations for _, (_, _, iterations, _) in stages)
     history = list[tuple[int, int, float, float, float]]()
     with say.progress(total) as show:
 
