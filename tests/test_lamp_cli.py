@@ -187,6 +187,8 @@ def test_a_project_edited_beyond_its_lens_is_refused(road, capfd):
         (["--chip", "1"], "--chip belongs to a lamp, which --lamp makes"),
         (["--angles", "60"], "--angles belongs to a lamp"),
         (["--lamp", "15", "--picture-size", "3m", "--throw", "-1m"], "distance"),
+        (["--lamp", "15", "--picture-size", "3m", "--throw", "29"], "must be 2 times --lamp or more"),
+        (["--lamp", "15", "--picture-size", "3mx1cm"], "at most 100 times as long as wide"),
     ],
 )
 def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):

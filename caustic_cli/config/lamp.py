@@ -9,7 +9,7 @@ from typing import Any
 
 from caustic_cli.config.settings import Given, Settings, index_of, read
 from caustic_cli.errors import InputError
-from caustic_cli.scene.lamp import Chip, Goal, Lamp
+from caustic_cli.scene.lamp import NEAREST, Chip, Goal, Lamp
 from caustic_cli.schema.table import (
     DesignSettings,
     LampSettings,
@@ -77,7 +77,9 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
     check_all("target", target, *({"flip", "encoding"} & {*target}))
     design = DesignSettings({"seed": default("design.seed"), **given.get("design", {}), "start": "transport"})
     full = Settings(SourceSettings(), lens, screen, target, design, lamp=lamp)
-    lamp_of(full), goal_of(full)
+    around, goal = lamp_of(full), goal_of(full)
+    if not goal.distance >= NEAREST * around.radius:
+        raise InputError(f"⟨screen.z⟩ of a lamp must be {NEAREST:g} times ⟨+lamp.radius⟩ or more, got {goal.distance:g} mm")
     return full
 
 

@@ -17,6 +17,8 @@ from caustic_cli.errors import InputError
 SHAPES = ("point", "disc", "rectangle")
 #: Widest target in the far field, degrees, along x and y: a lamp emits into z > 0.
 WIDEST = 178.0
+#: Largest ratio of its sides, and least distance of a plane target in radii of the lens.
+OBLONG, NEAREST = 100.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,10 @@ class Goal:
     def __post_init__(self):
         if not all(0 < s < math.inf for s in self.size):
             raise InputError(f"width and height of a target must be greater than 0, got {self.size}")
+        if max(self.size) > OBLONG * min(self.size):
+            raise InputError(
+                f"a target of a lamp is at most {OBLONG:g} times as long as wide, got {self.size[0]:g} x {self.size[1]:g}"
+            )
         if not self.distance > 0:
             raise InputError(f"the distance of a target must be greater than 0 mm, or inf, got {self.distance}")
         if self.far and max(self.size) > WIDEST:
