@@ -110,6 +110,12 @@ class Effort:
     #: The same for a chip with an extent, whose rays cost ten times as much and whose blur hides what is smaller: after the first
     #: two of the stages above, by the light of its centre.
     chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_000, 400_000, 60, 0.005),)
+    #: The same for two free-form surfaces, after the first of the stages above with one: 30 x 10 m from 8 m
+    two_stages: tuple[tuple[int, int, int, float], ...] = (
+        (800, 30_000, 80, 0.1),
+        (3_000, 60_000, 60, 0.03),
+        (10_800, 200_000, 60, 0.003),
+    )
     #: Control values along both axes; cells of the light along both axes for the transport.
     lamp_control: int = 64
     lamp_cells: int = 44
@@ -177,6 +183,7 @@ TEST = replace(
     vertex_cells=32,
     lamp_stages=((300, 5_000, 15, 0.1), (600, 10_000, 15, 0.02)),
     chip_stages=((300, 10_000, 5, 0.02),),
+    two_stages=((300, 5_000, 20, 0.1), (600, 10_000, 15, 0.02)),
     lamp_control=24,
     lamp_cells=16,
     final_rays=40_000,

@@ -12,13 +12,14 @@ from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lamp import LampObjective, design_lamp, directions_of, field_of, pixels_of, wanted
 from caustic_cli.inverse.refractor_transport import envelope, source_directions
-from caustic_cli.optics.lamp import PointGrid, emissions, land, through, through_point
+from caustic_cli.optics.lamp import PointGrid, emissions, land, least_wall, through, through_point
 from caustic_cli.optics.surfaces.polarfield import PolarField, direction_of, frame, stereographic
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.studies.lamp import lamp_figures
 
 FIELD = PolarField.uniform((12, 9), (3, 4))
 FAR = Goal((100.0, 60.0))
+QUICK = replace(STANDARD, lamp_stages=((400, 10_000, 25, 0.1), (1000, 20_000, 25, 0.02)), lamp_control=32, lamp_cells=20)
 
 
 def bumpy(field=FIELD, radius=12.0, height=0.05, seed=0):
@@ -160,7 +161,7 @@ def test_a_point_is_a_small_chip_and_its_grid_carries_the_same_light():
         torch.testing.assert_close(a, b, rtol=1e-7, atol=1e-9)
     grids = PointGrid.of(FIELD, 100_000)
     assert sum(float(grid.power.sum()) for grid in grids) == pytest.approx(1.0, abs=1e-12)
-    lights = [through_point(Lamp(), grid, values) for grid in grids]
+    lights = [through_point(Lamp(), FIELD, grid, values) for grid in grids]
     assert sum(float(light.power.sum()) for light in lights) == pytest.approx(float(one.power.sum()), abs=1e-5)
     for k in (0, 1, 2):
         mean = sum(float((light.power * light.direction[k]).sum()) for light in lights)
@@ -229,7 +230,7 @@ def test_an_ellipsoid_with_the_chip_at_its_focus_sends_all_light_into_one_direct
     log_r = envelope(direction_of(u, v), y[None], torch.ones(1, dtype=torch.float64), g, 0.01, lamp.index)
     values = field.net.interpolated(log_r.view(field.shape)) + math.log(10.0)
     (grid,) = PointGrid.of(field, 5000)
-    light = through_point(lamp, grid, values)
+    light = through_point(lamp, field, grid, values)
     x = torch.stack(direction_of(grid.u, grid.v), 1)
     seen = x @ y > 1.0 / lamp.index + 0.02  # beyond, the ellipsoid turns its back to y
     assert 0.15 < float(seen.double().mean()) < 0.8
@@ -260,6 +261,89 @@ def test_the_light_of_the_transport_is_lambertian():
     x, a = source_directions(80)
     assert float(a.sum()) == pytest.approx(1.0, abs=1e-12)
     assert float((a * x[:, 2]).sum()) == pytest.approx(2.0 / 3.0, abs=1e-3)
+
+
+# Two free-form surfaces
+
+
+@pytest.mark.parametrize("chip", [Chip(), Chip("disc", (3.0, 2.0))])
+def test_a_spherical_inner_surface_is_the_hemisphere(chip):
+    outer, rays = bumpy(height=0.2), emit(chip, 5000, 2)
+    one = through(Lamp(chip, inner=4.0), FIELD, rays, outer)
+    two = through(Lamp(chip, inner=4.0, surfaces=2), FIELD, rays, torch.stack([FIELD.sphere(4.0), outer]))
+    for a, b in zip((*one.point, *one.direction, one.power), (*two.point, *two.direction, two.power), strict=True):
+        lit = one.power > 0
+        torch.testing.assert_close(a[lit], b[lit], rtol=1e-9, atol=1e-9)
+    for cause, lost in one.lost.items():
+        torch.testing.assert_close(lost, two.lost[cause], rtol=1e-9, atol=1e-15)
+
+
+def test_all_light_is_booked_between_two_surfaces_and_the_grid_carries_the_same():
+    values = torch.stack([bumpy(radius=4.0, height=0.1, seed=3), bumpy(height=0.1)])
+    lamp = Lamp(inner=3.0, surfaces=2)
+    for chip in (Chip(), Chip("rectangle", (2.0, 2.0))):
+        rays = emit(chip, 30_000, 3)
+        light = through(replace(lamp, chip=chip), FIELD, rays, values)
+        assert float((light.power + sum(light.lost.values()) - rays.power).abs().max()) < 1e-18
+        assert float(light.lost["inner_fresnel"].sum()) > 0.0387
+    light = through(lamp, FIELD, emit(Chip(), 100_000, 3), values)
+    grids = [through_point(lamp, FIELD, grid, values) for grid in PointGrid.of(FIELD, 100_000)]
+    assert sum(float(one.power.sum()) for one in grids) == pytest.approx(float(light.power.sum()), abs=1e-4)
+
+
+def test_light_that_leaves_the_glass_on_its_way_is_booked_as_missed():
+    rays = emit(Chip(), 1000, 1)
+    light = through(Lamp(surfaces=2), FIELD, rays, torch.stack([FIELD.sphere(6.0), FIELD.sphere(5.0)]))  # crossed
+    assert float(light.power.sum()) == 0.0 and float(light.lost["missed"].sum()) > 0.9
+    dented = FIELD.sphere(4.0)
+    dented[5:7, :] += 0.9  # a wall across the inner surface, through which light of its flanks passes twice
+    with torch.no_grad():
+        light = through(Lamp(inner=3.0, surfaces=2), FIELD, emit(Chip(), 20_000, 1), torch.stack([dented, FIELD.sphere(15.0)]))
+    assert 0.0 < float(light.lost["missed"].sum()) < 0.9
+    assert float((light.power + sum(light.lost.values())).sum()) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_the_wall_between_two_surfaces_is_their_least_distance():
+    lamp, inner = Lamp(surfaces=2), FIELD.sphere(4.0)
+    assert least_wall(lamp, FIELD, torch.stack([inner, FIELD.sphere(10.0)])) == pytest.approx(6.0, abs=1e-6)
+    assert least_wall(lamp, FIELD, torch.stack([inner, FIELD.sphere(3.0)])) < 0.0
+    outer = bumpy(radius=7.0, height=0.1, seed=8)
+    wall = least_wall(lamp, FIELD, torch.stack([inner, outer]))
+    assert wall == pytest.approx(FIELD.extent(outer)[0] - 4.0, abs=2e-3)  # of a sphere it is along the radius
+    assert least_wall(Lamp(inner=4.0), FIELD, outer) == pytest.approx(wall, abs=2e-3)
+
+
+def test_two_surfaces_are_differentiable_to_second_order_remainders():
+    values = torch.stack([bumpy(radius=4.0, height=0.02, seed=3), bumpy(height=0.02)])
+    by = torch.randn(values.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
+    for chip in (Chip(), Chip("disc", (2.0, 2.0))):
+        lamp, rays = Lamp(chip, inner=3.0, surfaces=2), emit(chip, 400, 2)
+
+        def f(values, lamp=lamp, rays=rays):
+            light = through(lamp, FIELD, rays, values)
+            x, y, _ = land(FAR, light)
+            return (light.power * (0.01 * x + torch.sin(0.1 * y))).sum() + 0.1 * (rays.power * light.spare).sum()
+
+        start = values.clone().requires_grad_()
+        (g,) = torch.autograd.grad(f(start), start)
+        steps = [4e-4 * 0.5**k for k in range(5)]
+        remainders = [abs(float(f(values + h * by) - f(values) - h * (g * by).sum())) for h in steps]
+        assert 1.8 < np.polyfit(np.log(steps), np.log(remainders), 1)[0] < 2.2
+
+
+def test_two_surfaces_pass_more_light_than_one_and_keep_their_limits():
+    goal, square = Goal((30_000.0, 10_000.0), 8000.0), np.ones((2, 2))
+    effort = replace(QUICK, two_stages=((400, 10_000, 40, 0.1),), lamp_stages=((400, 10_000, 40, 0.1),))
+    fine, coarse = (wanted(goal, square, pixels_of(goal, count)).numpy() for count in (1500, 400))
+    found = {}
+    for surfaces, inner in ((1, 4.0), (2, 2.0)):
+        lamp = Lamp(index=1.49, inner=inner, surfaces=surfaces)
+        values = design_lamp(lamp, goal, square, effort=effort)
+        _, found[surfaces] = lamp_figures(lamp, goal, field_of(effort), values, fine, coarse, rays=100_000)
+        assert found[surfaces]["least_wall"] >= lamp.wall
+    assert found[2]["of_source"] > found[1]["of_source"] + 0.02
+    assert found[2]["greatest_radius"] < 15.5
+    assert FIELD.extent(values[0])[0] > 0.0 and field_of(effort).extent(values[0])[0] > 0.9 * 2.0
 
 
 # Gradients
@@ -297,8 +381,6 @@ def test_the_loss_is_differentiable_to_second_order_remainders(chip):
 
 
 # Design
-
-QUICK = replace(STANDARD, lamp_stages=((400, 10_000, 25, 0.1), (1000, 20_000, 25, 0.02)), lamp_control=32, lamp_cells=20)
 
 
 @pytest.mark.parametrize("goal", [Goal((2000.0, 2000.0), 1000.0), Goal((100.0, 60.0))])

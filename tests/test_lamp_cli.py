@@ -126,6 +126,22 @@ def test_the_light_lies_as_the_picture_says(flip, capfd):
     assert fits[0] > 0.7 and fits[0] > max(fits[1:]) + 0.1
 
 
+def test_two_surfaces_are_designed_rendered_and_exported(capfd):
+    figures = figures_of(capfd, "design", "uniform", *ROAD[:-1], "--lamp-surfaces", "2", "--chip", "0.5", "-o", "two")
+    assert figures["of_source"] > 0.8 and figures["least_wall"] > 1.0
+    found = LampDesign.of(Project.open("two"))
+    assert found.values.shape == (2, 24, 24) and found.lamp.inner == 2.0
+    seen = figures_of(capfd, "render", "two", "--rays", "20000", "-o", "two.png")
+    assert seen["of_source"] == pytest.approx(figures["of_source"], abs=0.02)
+    vertices, faces = lamp_mesh(found.lamp, found.field, found.values, (40, 90))
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    assert float((np.cross(a, b) * c).sum()) > 0
+    assert figures_of(capfd, "export", "two", "--format", "ldt")["flux"] > 800.0
+    text = Path("two/project.toml").read_text()
+    Path("two/project.toml").write_text(text.replace("surfaces = 2", "surfaces = 1"))
+    assert "holds no lamp" in refused(capfd, "render", "two", "-o", "two.png")
+
+
 def test_an_edited_project_is_rendered_as_it_says(road, capfd):
     text = (road / "project.toml").read_text()
     assert "chip = [0.0, 0.0]" in text and "[source]" not in text
@@ -175,6 +191,7 @@ def test_a_project_edited_beyond_its_lens_is_refused(road, capfd):
         (["--lamp", "15", "--angles", "60", "--lamp-inner", "14.5"], "must be greater than --lamp-inner and --lamp-wall"),
         (["--lamp", "15", "--angles", "60", "--chip", "9x9"], "[lamp] inner must be greater than the radius of the chip"),
         (["--lamp", "6", "--angles", "60", "--lamp-inner", "4"], "--lamp of"),
+        (["--lamp", "15", "--angles", "60", "--lamp-surfaces", "3"], "--lamp-surfaces must be"),
         (["--lamp", "15", "--angles", "60", "--chip-shape", "star"], "--chip-shape must be"),
         (["--lamp", "15", "--angles", "60", "--mag", "3"], "--mag is not a setting of a lamp"),
         (["--lamp", "15", "--angles", "60", "--source", "disc"], "--source is not a setting of a lamp"),

@@ -22,8 +22,9 @@ from caustic_cli.schema.table import (
     default,
 )
 
-#: Radius of the hemisphere over that of the lens, unless given; and the material, of which lamps are moulded.
-INNER, MATERIAL = 4.0 / 15.0, "PMMA"
+#: Radius of the hemisphere over that of the lens by the number of free-form surfaces, unless given; and the material, of which
+#: lamps are moulded.
+INNER, MATERIAL = {1: 4.0 / 15.0, 2: 2.0 / 15.0}, "PMMA"
 #: The settings of other sections that a lamp has; parameters have no section.
 TAKEN = {
     "lens": ("index", "glass", "wavelength"),
@@ -52,8 +53,8 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
     lamp = LampSettings.of(given["lamp"])
     if lamp.radius is None:
         raise InputError(f"⟨lamp.{next(iter(given['lamp']))}⟩ belongs to a lamp, which ⟨+lamp.radius⟩ makes")
-    lamp = lamp.filled(inner=INNER * lamp.radius)
     check_all("lamp", lamp, *lamp)
+    lamp = lamp.filled(inner=INNER[lamp.surfaces] * lamp.radius)
     lens = LensSettings(given.get("lens", {}))
     lens = lens if {"index", "glass"} & {*lens} else lens.filled(glass=MATERIAL)
     target, screen = TargetSettings(given.get("target", {})), ScreenSettings()
@@ -108,7 +109,7 @@ def lamp_of(settings: Settings) -> Lamp:
     s = settings.lamp
     assert s is not None and s.radius is not None and s.inner is not None
     chip = Chip("point") if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip)
-    return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall)
+    return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall, s.surfaces)
 
 
 def goal_of(settings: Settings) -> Goal:

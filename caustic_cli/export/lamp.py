@@ -1,4 +1,4 @@
-"""The solid of a lamp as a closed triangle mesh: free-form surface, hemisphere and the ring of the base between them.
+"""The solid of a lamp as a closed triangle mesh: the outer surface, the inner one and the ring of the base between them.
 
 Both surfaces are sampled on rings of the stereographic disc with equal steps of rho, between points at the same angles; the
 innermost ring is a single point on the axis.  Vertices run counter-clockwise seen from outside.
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.export import obj, ply, stl
+from caustic_cli.optics.lamp import sides
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Lamp
 
@@ -43,9 +44,9 @@ def lamp_mesh(lamp: Lamp, field: PolarField, values: Tensor, samples: tuple[int,
     rho = np.repeat(np.arange(1, rings + 1) / rings, around)
     angle = np.tile(2.0 * math.pi * np.arange(around) / around, rings)
     u, v = (torch.from_numpy(np.concatenate([[0.0], rho * f(angle)])) for f in (np.cos, np.sin))
-    outer, inner = (
-        np.stack([c.numpy() for c in field.points(net, u, v)], 1) for net in (values.detach(), field.sphere(lamp.inner))
-    )
+    inside, free = sides(values.detach())
+    inside = field.sphere(lamp.inner) if inside is None else inside
+    outer, inner = (np.stack([c.numpy() for c in field.points(net, u, v)], 1) for net in (free, inside))
     for points in (outer, inner):
         points[-around:, 2] = 0.0  # the rim lies in the base plane, but for rounding
     cap, count = _disc(rings, around), len(outer)

@@ -25,7 +25,7 @@ from caustic_cli.inverse.parametrisation import InverseLaplacian
 from caustic_cli.inverse.refractor_transport import CELLS, transported
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.lamp import ChipRays, PointGrid, emissions, land, through, through_point
+from caustic_cli.optics.lamp import ChipRays, PointGrid, emissions, land, least_wall, through, through_point
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.polarfield import PolarField
@@ -38,6 +38,10 @@ MARGIN = 0.005
 APRON, FILTER = 4, Filter("cosine", (3, 3))
 #: Degree of the spline.
 DEGREE = 3
+#: Points of a grid at which limits of two surfaces hold, weight of their squares, and the wall there over that to be kept.
+ROOM_POINTS, STIFF, SAFE = 8000, 3.0, 1.3
+#: Radius of the first inner surface, a sphere, over its least one.
+BEGIN = 4.0 / 3.0
 
 
 def pixels_of(goal: Goal, count: int) -> tuple[int, int]:
@@ -83,12 +87,13 @@ class LampObjective:
         self.goal, self.weight = goal, weight
         point = lamp.chip.shape == "point"
         self.rays: Sequence[PointGrid | ChipRays] = PointGrid.of(field, rays) if point else list(emissions(lamp.chip, rays, seed))
-        self.through = partial(through_point, lamp) if point else partial(through, lamp, field)
+        self.through = partial(through_point if point else through, lamp, field)
         self.screen = Screen(goal.size, resolution=(target.shape[0], target.shape[1])).grown((APRON, APRON))
         smooth = FILTER.smooth(torch.nn.functional.pad(target.double(), (APRON,) * 4))
         self.target = smooth / smooth.sum()
         self.lit = float((target > 0).sum())
         self.splat = backend_for("cpu").splat
+        self.room = Room(lamp, field) if lamp.surfaces == 2 else None
 
     def terms(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """rho^2, efficiency (light on target and apron), mean distance beside the target, and lack of margin."""
@@ -109,7 +114,29 @@ class LampObjective:
 
     def __call__(self, values: Tensor) -> Tensor:
         square, efficiency, distance, lack = self.terms(values)
-        return square + self.weight * (1.0 - efficiency + distance + lack)
+        loss = square + self.weight * (1.0 - efficiency + distance + lack)
+        return loss if self.room is None else loss + self.room.lack(values)
+
+
+class Room:
+    """Limits of two free-form surfaces, at the points of a grid: a wall between them, estimated by the radial distance and the
+    slopes, the least radius of the inner one, and the greatest of the outer one."""
+
+    def __init__(self, lamp: Lamp, field: PolarField):
+        self.lamp, self.grids = lamp, PointGrid.of(field, ROOM_POINTS)
+
+    def lack(self, values: Tensor) -> Tensor:
+        """Sum of squares of what lacks, relative to each limit, per point, times STIFF."""
+        total, count, lamp = torch.zeros((), dtype=torch.float64), 0, self.lamp
+        for grid in self.grids:
+            hits = [grid.hits(net) for net in values]
+            inner, outer = (sum(c * c for c in hit.point).sqrt() for hit in hits)
+            steep = torch.maximum(*(hit.p * hit.p + hit.q * hit.q for hit in hits))
+            wall = (outer - inner) / (1.0 + steep).sqrt()
+            lacks = (1.0 - wall / (SAFE * lamp.wall), 1.0 - inner / lamp.inner, outer / lamp.radius - 1.0)
+            total = total + sum((lack.clamp_min(0.0) ** 2).sum() for lack in lacks)
+            count += len(inner)
+        return STIFF / count * total
 
 
 def refine(
@@ -152,11 +179,17 @@ def field_of(effort: Effort) -> PolarField:
     return PolarField.uniform((effort.lamp_control,) * 2, (DEGREE,) * 2)
 
 
-def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Chip, tuple[int, int, int, float]]]:
-    """The stages of a design, each with the chip whose light it follows: that of the lamp, or a point at its centre."""
+def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Lamp, tuple[int, int, int, float]]]:
+    """The stages of a design, each with the lamp that it refines: the lamp itself, with one surface or with a point as its chip."""
+    point = replace(lamp, chip=Chip())
+    if lamp.surfaces == 2:
+        found = [(replace(point, surfaces=1), effort.lamp_stages[0]), *((point, stage) for stage in effort.two_stages)]
+    else:
+        found = [(point, stage) for stage in effort.lamp_stages]
     if lamp.chip.shape == "point":
-        return [(lamp.chip, stage) for stage in effort.lamp_stages]
-    return [(Chip(), stage) for stage in effort.lamp_stages[:2]] + [(lamp.chip, stage) for stage in effort.chip_stages]
+        return found
+    kept = 3 if lamp.surfaces == 2 else 2
+    return [*found[:kept], *((lamp, stage) for stage in effort.chip_stages)]
 
 
 def design_lamp(
@@ -181,10 +214,11 @@ def design_lamp(
     field = field_of(effort)
     values = initial_lamp(lamp, goal, field, picture, effort.lamp_cells)
     refuse_thin(lamp, field, values)
-    for k, (chip, (pixels, rays, iterations, weight)) in enumerate(stages_of(lamp, effort)):
+    for k, (refined, (pixels, rays, iterations, weight)) in enumerate(stages_of(lamp, effort)):
+        if refined.surfaces == 2 and values.ndim == 2:
+            values = torch.stack([field.sphere(BEGIN * lamp.inner), values])
         target = wanted(goal, picture, pixels_of(goal, pixels))
-        lit = replace(lamp, chip=chip)
-        objective = LampObjective(lit, goal, field, target, rays, stream(seed, f"stage {k}"), weight)
+        objective = LampObjective(refined, goal, field, target, rays, stream(seed, f"stage {k}"), weight)
         values = refine(objective, values, iterations, partial(on_iteration, k))
     refuse_thin(lamp, field, values)
     return values
@@ -196,11 +230,16 @@ def refuse_thin(lamp: Lamp, field: PolarField, values: Tensor) -> None:
     Raises:
         InputError: it does; giving the radius with which it would not.
     """
-    least, _ = field.extent(values)
-    if least < lamp.inner + lamp.wall:
-        needed = lamp.radius * (lamp.inner + lamp.wall) / least
+    least = least_wall(lamp, field, values)
+    if least >= lamp.wall:
+        return
+    if values.ndim == 3:
         raise InputError(
-            f"the free-form surface comes within {least - lamp.inner:.3g} mm of the hemisphere of {lamp.inner:g} mm, and the wall"
-            f" must be {lamp.wall:g} mm: ⟨lamp.radius⟩ of {math.ceil(10.1 * needed) / 10:g} mm or more, or a smaller ⟨+lamp.inner⟩,"
-            " is needed"
+            f"the two free-form surfaces come within {least:.3g} mm of each other, and ⟨lamp.wall⟩ must be {lamp.wall:g} mm: a"
+            " larger ⟨+lamp.radius⟩ or a smaller ⟨+lamp.inner⟩ is needed"
         )
+    needed = lamp.radius * (lamp.inner + lamp.wall) / (lamp.inner + least)
+    raise InputError(
+        f"the free-form surface comes within {least:.3g} mm of the hemisphere of {lamp.inner:g} mm, and the wall must be"
+        f" {lamp.wall:g} mm: ⟨lamp.radius⟩ of {math.ceil(10.1 * needed) / 10:g} mm or more, or a smaller ⟨+lamp.inner⟩, is needed"
+    )

@@ -17,7 +17,9 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from caustic_cli.optics.interface import reflectance, refract
@@ -39,6 +41,8 @@ from caustic_cli.scene.lamp import Chip, Goal, Lamp
 LOSSES = ("inner_fresnel", "missed", "total_internal_reflection", "outer_fresnel")
 #: Least component along z of light that is followed to a plane: flatter light lands beyond 50 distances from the axis.
 SHALLOW = 0.02
+#: Points of a path within the lens at which it is tested against the inner surface.
+PROBES = 3
 #: Rays traced at a time.
 CHUNK = 1 << 17
 _DEGREE = 180.0 / math.pi
@@ -125,49 +129,112 @@ class PointGrid:
         return polar_hit(self.u, self.v, g, gu, gv)
 
 
-def through_point(lamp: Lamp, rays: PointGrid, values: Tensor) -> LampLight:
-    """Light of a point at the origin through the lens; differentiable by the control values (n, m) of log r."""
-    return _from_point(lamp, rays.hits(values), rays.power)
+def sides(values: Tensor) -> tuple[Tensor | None, Tensor]:
+    """Control values (n, m) of the inner surface, None for a hemisphere, and of the outer one, from those of a lamp: (n, m) of the
+    outer surface, or (2, n, m) of both."""
+    return (None, values) if values.ndim == 2 else (values[0], values[1])
+
+
+def least_wall(lamp: Lamp, field: PolarField, values: Tensor) -> float:
+    """Least distance of the two surfaces, mm; of two free-form ones between points of `PolarField.extent`; negative where the outer
+    one is nearer to the origin than the hemisphere."""
+    inner, outer = sides(values)
+    if inner is None:
+        return field.extent(outer)[0] - lamp.inner
+    one, other = (np.stack([c.numpy() for c in field.points(net.detach(), *field.sampled())], 1) for net in (inner, outer))
+    apart = float((np.linalg.norm(other, axis=1) - np.linalg.norm(one, axis=1)).min())  # along radii: an upper bound
+    return apart if apart <= 0 else min(apart, float(cKDTree(one).query(other, distance_upper_bound=apart)[0].min()))
+
+
+def through_point(lamp: Lamp, field: PolarField, rays: PointGrid, values: Tensor) -> LampLight:
+    """Light of a point at the origin through the lens; differentiable by the control values of log r, see `sides`."""
+    inner, outer = sides(values)
+    if inner is None:
+        return _from_point(lamp, rays.hits(outer), rays.power)
+    return _between(lamp, field, (inner, outer), rays.hits(inner), _along(rays.power), rays.power)
+
+
+def _along(like: Tensor) -> Vectors:
+    """The direction of the frame's axis, for as many rays."""
+    zero = torch.zeros_like(like)
+    return zero, zero, zero + 1.0
 
 
 def _from_point(lamp: Lamp, hit: PolarHit, power: Tensor) -> LampLight:
     """Light of the origin, which meets the hemisphere at normal incidence and the surface along the frame's axis."""
-    zero, one = torch.zeros_like(hit.p), torch.ones_like(hit.p)
     kept = 1.0 - ((lamp.index - 1.0) / (lamp.index + 1.0)) ** 2
-    return _leave(lamp, hit, (zero, zero, one), kept * power, {"inner_fresnel": (1.0 - kept) * power})
+    return _leave(
+        lamp, hit, _along(power), kept * power, {"inner_fresnel": (1.0 - kept) * power, "missed": torch.zeros_like(power)}
+    )
 
 
 def through(lamp: Lamp, field: PolarField, rays: ChipRays, values: Tensor) -> LampLight:
-    """Light of a chip through the lens; differentiable by the control values (n, m) of log r."""
+    """Light of a chip through the lens; differentiable by the control values of log r, see `sides`."""
+    inner, outer = sides(values)
     if lamp.chip.shape == "point":
-        return _from_point(lamp, field.from_origin(values, *stereographic(*rays.direction)), rays.power)
-    origin, direction, power = _enter(lamp, rays)
-    hit = field.intersect(values, origin, direction)
-    local = to_frame(frame(hit.u, hit.v), direction)
-    return _leave(lamp, hit, local, power, {"inner_fresnel": rays.power - power})
+        at = stereographic(*rays.direction)
+        if inner is None:
+            return _from_point(lamp, field.from_origin(outer, *at), rays.power)
+        return _between(lamp, field, (inner, outer), field.from_origin(inner, *at), _along(rays.power), rays.power)
+    hit = _on_hemisphere(lamp, rays) if inner is None else field.intersect(inner, rays.origin, rays.direction)
+    local = to_frame(frame(hit.u, hit.v), rays.direction)
+    return _between(lamp, field, (inner, outer), hit, local, rays.power)
 
 
-def _enter(lamp: Lamp, rays: ChipRays) -> tuple[Vectors, Vectors, Tensor]:
-    """Rays behind the hemisphere: points, directions and power."""
+def _on_hemisphere(lamp: Lamp, rays: ChipRays) -> PolarHit:
+    """Where rays meet the hemisphere: all do."""
     (x, y, z), (dx, dy, dz), radius = rays.origin, rays.direction, lamp.inner
     along = x * dx + y * dy + z * dz
     t = (along * along + (radius * radius - (x * x + y * y + z * z))).sqrt() - along  # the origin lies within: one root
-    px, py, pz = x + t * dx, y + t * dy, z + t * dz
-    axes = frame(*stereographic(px, py, pz))
-    local = to_frame(axes, rays.direction)
-    flat = torch.zeros_like(t)
-    out, passes, c, s = refract(local, flat, flat, 1.0 / lamp.index)
-    power = torch.where(passes, rays.power * (1.0 - reflectance("exact", c, s, 1.0 / lamp.index)), flat)
-    return (px, py, pz), from_frame(axes, out), power
+    point, flat = (x + t * dx, y + t * dy, z + t * dz), torch.zeros_like(t)
+    return PolarHit(point, *stereographic(*point), flat, flat, torch.ones_like(t, dtype=torch.bool))
+
+
+def _between(
+    lamp: Lamp, field: PolarField, surfaces: tuple[Tensor | None, Tensor], hit: PolarHit, local: Vectors, power: Tensor
+) -> LampLight:
+    """Refraction at the inner surface, and what follows; local: directions in front of it, in the frames of the points.
+
+    Without derivatives, light that meets a free-form inner surface again, from within the lens, is booked as missed.
+    """
+    zero, (inner, outer) = torch.zeros_like(power), surfaces
+    met, local = _met(hit, local)
+    out, _, c, s = refract(local, hit.p, hit.q, 1.0 / lamp.index)
+    arriving = torch.where(met, power, zero)
+    reflected = arriving * reflectance("exact", c, s, 1.0 / lamp.index)
+    direction = from_frame(frame(hit.u, hit.v), out)
+    further = field.intersect(outer, hit.point, direction)
+    if inner is not None and not torch.is_grad_enabled():  # in a judgement; a design has a wall instead
+        again = _meets_again(field, inner, hit.point, further.point)
+        further = further._replace(valid=further.valid & ~again)
+    lost = {"inner_fresnel": reflected, "missed": power - arriving}
+    return _leave(lamp, further, to_frame(frame(further.u, further.v), direction), arriving - reflected, lost)
+
+
+def _meets_again(field: PolarField, inner: Tensor, start: Vectors, end: Vectors) -> Tensor:
+    """Whether straight paths within the lens lie within the inner surface at one of PROBES points between their ends."""
+    with torch.no_grad():
+        found = torch.zeros_like(start[0], dtype=torch.bool)
+        for k in range(1, PROBES + 1):
+            x, y, z = (a + k / (PROBES + 1) * (b - a) for a, b in zip(start, end, strict=True))
+            g = field.net.evaluate(inner, *stereographic(x, y, z))[0]
+            found |= 0.5 * (x * x + y * y + z * z).log() < g
+        return found
+
+
+def _met(hit: PolarHit, local: Vectors) -> tuple[Tensor, Vectors]:
+    """Whether rays meet a surface from within, and their directions, masked where they do not, which keeps NaN out of gradients."""
+    met = hit.valid & (local[2] - hit.p * local[0] - hit.q * local[1] > LEAST_COSINE)
+    if bool(met.all()):
+        return met, local
+    (x, y, z), zero = local, torch.zeros_like(hit.u)
+    return met, (torch.where(met, x, zero - hit.p), torch.where(met, y, zero - hit.q), torch.where(met, z, zero + 1.0))
 
 
 def _leave(lamp: Lamp, hit: PolarHit, local: Vectors, power: Tensor, lost: dict[str, Tensor]) -> LampLight:
     """Refraction at the free-form surface; local: directions within the lens, in the frames of the points."""
     n, zero = lamp.index, torch.zeros_like(power)
-    met = hit.valid & (local[2] - hit.p * local[0] - hit.q * local[1] > LEAST_COSINE)
-    if not bool(met.all()):  # a masked argument keeps NaN out of gradients
-        x, y, z = local
-        local = torch.where(met, x, zero), torch.where(met, y, zero), torch.where(met, z, zero + 1.0)
+    met, local = _met(hit, local)
     out, passes, c, s = refract(local, hit.p, hit.q, n)
     square = 1.0 + hit.p * hit.p + hit.q * hit.q
     spare = 1.0 - n * n * (1.0 - c * c / square)
@@ -176,7 +243,7 @@ def _leave(lamp: Lamp, hit: PolarHit, local: Vectors, power: Tensor, lost: dict[
     arriving = torch.where(met, power, zero)
     leaving = torch.where(passes, power * (1.0 - reflected), zero)
     lost = lost | {
-        "missed": power - arriving,
+        "missed": lost["missed"] + (power - arriving),
         "total_internal_reflection": torch.where(met & ~passes, power, zero),
         "outer_fresnel": torch.where(passes, power * reflected, zero),
     }

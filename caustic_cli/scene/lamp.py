@@ -111,8 +111,12 @@ class Lamp:
     #: Greatest distance of the free-form surface from the chip's centre, mm, and least distance from the hemisphere.
     radius: float = 15.0
     wall: float = 1.0
+    #: Number of free-form surfaces: with 2 the inner side is one instead of the hemisphere, and `inner` its least radius.
+    surfaces: int = 1
 
     def __post_init__(self):
+        if self.surfaces not in (1, 2):
+            raise InputError(f"a lamp has 1 or 2 free-form surfaces, got {self.surfaces!r}")
         if not 1.0 < self.index <= 5.0:
             raise InputError(f"⟨lens.index⟩ of a lamp must be greater than 1 and at most 5, got {self.index!r}")
         if not self.chip.reach < self.inner < math.inf:

@@ -279,7 +279,10 @@ class LampSettings(Section):
             " light; greatest distance of the free-form surface from the chip", "mm", *LENS, derived="no lamp",
             option=Option("--lamp", "MM"))
     inner: float | None = setting("radius of the hemisphere around the chip that is the inner side of the lens", "mm", *LENS,
-            derived="4/15 of lamp.radius", option=Option("--lamp-inner", "MM"))
+            derived="4/15 of lamp.radius, 2/15 with two free-form surfaces", option=Option("--lamp-inner", "MM"))
+    surfaces: int = setting("free-form surfaces: 1, around a hemisphere, or 2, which share the deflection; lamp.inner is then the"
+            " least radius of the inner one", low=1, high=2, default=1, why="one is cheaper to make", written=False,
+            option=Option("--lamp-surfaces", "1|2"))
     wall: float = setting("least distance between hemisphere and free-form surface", "mm", *LENS, default=1.0, why="injection"
             " moulding of acrylic", option=Option("--lamp-wall", "MM"))
     chip: Pair = setting("full width and height of the chip, 0 for a point", "mm", 0.0, 1e6, default=[0.0, 0.0], why="the limit"

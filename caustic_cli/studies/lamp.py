@@ -17,7 +17,7 @@ from scipy.ndimage import minimum_filter
 from torch import Tensor
 
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.lamp import LOSSES, LampLight, emissions, land, through
+from caustic_cli.optics.lamp import LOSSES, LampLight, emissions, land, least_wall, sides, through
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.polarfield import PolarField
@@ -118,7 +118,6 @@ def lamp_figures(
     """
     pixels, fewer = ((t.shape[0], t.shape[1]) for t in (target, coarse))
     found = lamp_image(lamp, goal, field, values, pixels, fewer, rays, seed)
-    least, greatest = field.extent(values)
     uniformity = None if shaded else _least_over_mean(found.coarse, coarse, _compared(coarse, goal, False, BORDER))
     return found, {
         "of_source": float(found.image.sum()),
@@ -127,8 +126,8 @@ def lamp_figures(
         "uniformity": uniformity,
         "uncoated_limit": lamp.uncoated_limit,
         "lost": found.lost,
-        "least_wall": least - lamp.inner,
-        "greatest_radius": greatest,
+        "least_wall": least_wall(lamp, field, values),
+        "greatest_radius": field.extent(sides(values)[1])[1],
         "pixels": list(pixels),
         "rays": found.rays,
     }

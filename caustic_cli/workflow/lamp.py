@@ -74,7 +74,8 @@ class LampDesign:
         """
         saved, s = project.load(), project.settings
         lamp, goal, field, values = lamp_of(s), goal_of(s), PolarField(saved.spaces), saved.state.heights
-        if tuple(values.shape) != field.shape or not bool(torch.isfinite(values).all()):
+        shape = field.shape if lamp.surfaces == 1 else (2, *field.shape)
+        if tuple(values.shape) != shape or not bool(torch.isfinite(values).all()):
             raise project.error("holds no lamp in its checkpoint: design it again")
         try:
             refuse_thin(lamp, field, values)
@@ -175,8 +176,10 @@ def _one_thread() -> Iterator[None]:
 
 def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
     """What limits a lamp, before its design: its uncoated surfaces, and the deflection of one."""
-    most = math.degrees(math.acos(1.0 / lamp.index))
     yield f"uncoated surfaces pass at most {lamp.uncoated_limit:.1%} of the light, by normal incidence"
+    if lamp.surfaces == 2:
+        return
+    most = math.degrees(math.acos(1.0 / lamp.index))
     sides = [math.radians(s / 2) if goal.far else math.atan(s / 2 / goal.distance) for s in goal.size]
     if (needed := 90.0 - math.degrees(min(sides))) > most:
         yield (
@@ -243,7 +246,7 @@ def export(
         write_lamp(path, format, lamp.lamp, lamp.field, lamp.values, samples)
     else:
         table = intensity_table(lamp.lamp, lamp.field, lamp.values, rays=current_effort().final_rays, seed=project.seed)
-        greatest = lamp.field.extent(lamp.values)[1]
+        greatest = lamp.field.extent(lamp.values if lamp.lamp.surfaces == 1 else lamp.values[1])[1]
         name = project.path.resolve().stem
         PHOTOMETRIC[format][1](path, Photometry(table.planes, table.angles, table.values, FLUX, name, 2.0 * greatest, greatest))
         more = {"flux": table.flux, "peak_candela": table.peak}

@@ -141,12 +141,16 @@ class PolarField:
         low, high = torch.aminmax(values.detach())
         return math.exp(float(low)), math.exp(float(high))
 
-    def extent(self, values: Tensor) -> tuple[float, float]:
-        """Least and greatest r on the side z >= 0, mm, at EXTENT_POINTS^2 points."""
+    @staticmethod
+    def sampled() -> tuple[Tensor, Tensor]:
+        """EXTENT_POINTS^2 points (u, v) of the side z >= 0, on rings."""
         rho = torch.linspace(0.0, 1.0, EXTENT_POINTS, dtype=torch.float64)
         angle = torch.linspace(0.0, 2.0 * math.pi, EXTENT_POINTS, dtype=torch.float64)
-        u, v = (rho[:, None] * torch.cos(angle)).reshape(-1), (rho[:, None] * torch.sin(angle)).reshape(-1)
-        low, high = torch.aminmax(self.net.evaluate(values.detach(), u, v)[0])
+        return (rho[:, None] * torch.cos(angle)).reshape(-1), (rho[:, None] * torch.sin(angle)).reshape(-1)
+
+    def extent(self, values: Tensor) -> tuple[float, float]:
+        """Least and greatest r on the side z >= 0, mm, at EXTENT_POINTS^2 points."""
+        low, high = torch.aminmax(self.net.evaluate(values.detach(), *self.sampled())[0])
         return math.exp(float(low)), math.exp(float(high))
 
     def from_origin(self, values: Tensor, u: Tensor, v: Tensor) -> PolarHit:
