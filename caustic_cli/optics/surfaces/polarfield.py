@@ -27,7 +27,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.surfaces.base import FIRST
+from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 Vectors = tuple[Tensor, Tensor, Tensor]
@@ -168,39 +168,39 @@ class PolarField:
         Args:
             origin: mm; direction: unit vectors; (N,) each.
         """
+        differentiable = torch.is_grad_enabled()
         with torch.no_grad():
-            o, d, net = (tuple(c.detach() for c in w) for w in (origin, direction, (values,)))
-            t, valid = self._root(net[0], o, d)
-        at = [t * c + s for c, s in zip(direction, origin, strict=True)]
-        # One Newton step with the derivatives of the root gives t its derivatives by the implicit function theorem.
-        f, slope = self._residual(values, at, direction)
-        t = t - torch.where(valid, f / slope.detach(), torch.zeros_like(f))
-        x, y, z = (t * c + s for c, s in zip(direction, origin, strict=True))
-        u, v = stereographic(x, y, z)
-        p, q = slopes(u, v, *self._attached(values, u, v)[1:])
+            (ox, oy, oz), (dx, dy, dz), net = origin, direction, values.detach()
+            o, d = (ox.detach(), oy.detach(), oz.detach()), (dx.detach(), dy.detach(), dz.detach())
+            t, valid = self._root(net, o, d)
+            at = stereographic(*(s + t * c for s, c in zip(o, d, strict=True)))
+            second = self.at(net, *at, SECOND) if differentiable else None
+        here = self.net.evaluate(values, *at)
+        # One Newton step with the derivatives of the root gives t its derivatives by the implicit function theorem; g near the root
+        # is a Taylor polynomial, exact there with its first derivatives by points.
+        x, y, z = (s + t * c for s, c in zip(origin, direction, strict=True))
+        (g, _, _), _ = _near(here, second, at, stereographic(x, y, z))
+        f = 0.5 * (x * x + y * y + z * z).log() - g
+        with torch.no_grad():
+            a, b, e = frame(*at)
+            p, q = slopes(*at, here[1], here[2])
+            along = to_frame((a, b, e), d)
+            slope = (along[2] - p * along[0] - q * along[1]) / (x * x + y * y + z * z).sqrt()
+        t = t - torch.where(valid, f / slope, torch.zeros_like(f))
+        x, y, z = (s + t * c for s, c in zip(origin, direction, strict=True))
+        (_, gu, gv), (u, v) = _near(here, second, at, stereographic(x, y, z))
+        p, q = slopes(u, v, gu, gv)
         return PolarHit((x, y, z), u, v, p, q, valid)
 
     def _residual(self, values: Tensor, at, direction) -> tuple[Tensor, Tensor]:
-        """F and its derivative by t, the latter without derivatives of its own."""
+        """F and its derivative by t."""
         x, y, z = at
         square = x * x + y * y + z * z
         u, v = stereographic(x, y, z)
-        g, gu, gv = self._attached(values, u, v)
-        with torch.no_grad():
-            a, b, e = frame(u, v)
-            p, q = slopes(u, v, gu, gv)
-            along = to_frame((a, b, e), direction)
-            slope = (along[2] - p * along[0] - q * along[1]) / square.sqrt()
-        return 0.5 * square.log() - g, slope
-
-    def _attached(self, values: Tensor, u: Tensor, v: Tensor) -> list[Tensor]:
-        """g, g_u, g_v, differentiable by values and, to first order, by points."""
-        at = u.detach(), v.detach()
-        if not (u.requires_grad or v.requires_grad):
-            return self.net.evaluate(values, *at)
-        g, gu, gv, guu, guv, gvv = self.at(values, *at, [*FIRST, (2, 0), (1, 1), (0, 2)])
-        du, dv = u - at[0], v - at[1]
-        return [g + gu * du + gv * dv, gu + guu * du + guv * dv, gv + guv * du + gvv * dv]
+        g, gu, gv = self.net.evaluate(values, u, v)
+        p, q = slopes(u, v, gu, gv)
+        along = to_frame(frame(u, v), direction)
+        return 0.5 * square.log() - g, (along[2] - p * along[0] - q * along[1]) / square.sqrt()
 
     def _root(self, values: Tensor, o, d) -> tuple[Tensor, Tensor]:
         """t of the intersection, and whether there is one."""
@@ -234,6 +234,15 @@ class PolarField:
         central = r <= 1e-300  # the origin, which has no direction, lies within
         u, v = stereographic(x, y, torch.where(central, torch.ones_like(z), z))
         return central | (r.log() < self.net.evaluate(values, u, v)[0])
+
+
+def _near(here, second, at: tuple[Tensor, Tensor], to: tuple[Tensor, Tensor]):
+    """g, g_u, g_v at points from those `here`, at coordinates `at`, and second derivatives there, None for zero; and the points."""
+    (g, gu, gv), du, dv = here, to[0] - at[0], to[1] - at[1]
+    if second is None:
+        return (g, gu, gv), to
+    guu, guv, gvv = second
+    return (g + gu * du + gv * dv, gu + guu * du + guv * dv, gv + guv * du + gvv * dv), to
 
 
 def slopes(u: Tensor, v: Tensor, gu: Tensor, gv: Tensor) -> tuple[Tensor, Tensor]:
