@@ -75,7 +75,8 @@ def directions_of(goal: Goal, pixels: tuple[int, int]) -> Tensor:
 
 
 class LampObjective:
-    """The loss of control values (n, m), for fixed rays: of a point those of a grid, of a chip a Sobol sequence.
+    """The loss of control values, (n, m) or (2, n, m) (`optics.lamp.sides`), for fixed rays: of a point those of a grid, of a
+    chip a Sobol sequence.
 
     Args:
         target: (n_x, n_y) as of `wanted`.
@@ -201,7 +202,8 @@ def design_lamp(
     seed: int = 0,
     on_iteration: Callable[[int, int, float], None] = lambda stage, k, loss: None,
 ) -> Tensor:
-    """The surface that sends the light of a chip to a picture: control values of log r, r in mm, over the spline spaces `field_of`.
+    """The surfaces that send the light of a chip to a picture: control values of log r, r in mm, over the spline spaces `field_of`,
+    (n, m) of one or (2, n, m) of two (`optics.lamp.sides`).
 
     Args:
         picture: as of `wanted`.
@@ -209,7 +211,7 @@ def design_lamp(
         on_iteration: called with the number of the stage, that of iterations in it and the loss.
 
     Raises:
-        InputError: the picture is black, or the surface comes too near to the hemisphere.
+        InputError: the picture is black, or the surfaces come too near to each other.
     """
     field = field_of(effort)
     values = initial_lamp(lamp, goal, field, picture, effort.lamp_cells)
@@ -225,10 +227,10 @@ def design_lamp(
 
 
 def refuse_thin(lamp: Lamp, field: PolarField, values: Tensor) -> None:
-    """Refuse a surface that comes nearer to the hemisphere than the least wall.
+    """Refuse surfaces that come nearer to each other than the least wall.
 
     Raises:
-        InputError: it does; giving the radius with which it would not.
+        InputError: they do; of one surface with the radius with which it would not.
     """
     least = least_wall(lamp, field, values)
     if least >= lamp.wall:

@@ -1,8 +1,8 @@
 """A lamp: a lens around a light-emitting chip, and where its light is wanted.
 
 The chip lies in the plane z = 0 with its centre at the origin, and emits into z > 0 by Lambert's law.  The lens lies between a
-hemisphere about the origin, which does not deflect the light of the chip's centre, and a free-form surface; its base is the ring
-between the two in the plane z = 0.
+hemisphere about the origin, which does not deflect the light of the chip's centre, or a second free-form surface, and a free-form
+surface; its base is the ring between the two in the plane z = 0.
 """
 
 from __future__ import annotations

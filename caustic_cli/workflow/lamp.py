@@ -53,8 +53,8 @@ WHITE = 0.999
 class LampDesign:
     """A designed lamp.
 
-    project: where it is kept; values: control values (n, m) of log r over the spline spaces `field`; picture: irradiance (a, b), or
-    intensity in the far field; figures: of the JSON table.
+    project: where it is kept; values: control values of log r over the spline spaces `field`, (n, m) or (2, n, m)
+    (`optics.lamp.sides`); picture: irradiance (a, b), or intensity in the far field; figures: of the JSON table.
     """
 
     project: Project
