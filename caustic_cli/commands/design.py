@@ -96,12 +96,12 @@ def run(asked: DesignOptions) -> None:
             compile_behind(["multigrid"], more=True)
     device = asked.start_torch()
 
+    from caustic_cli.config.lamp import asks_for_lamp  # noqa: PLC0415
     from caustic_cli.inverse import ranks  # noqa: PLC0415
-    from caustic_cli.project.new import merged  # noqa: PLC0415
     from caustic_cli.workflow import library  # noqa: PLC0415
     from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
-    if not asked.resume and "lamp" in merged(asked.given, asked.preset, asked.config):
+    if not asked.resume and asks_for_lamp(asked.given, asked.preset, asked.config):
         with _saying_what_is_kept(path):
             _design_lamp(asked, picture, path)
         return

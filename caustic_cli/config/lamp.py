@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from caustic_cli.config import presets
 from caustic_cli.config.settings import Given, Settings, index_of, read
 from caustic_cli.errors import InputError
 from caustic_cli.scene.lamp import NEAREST, Chip, Goal, Lamp
@@ -38,6 +39,12 @@ PARAMETERS = ("throw", "picture_size", "screen_place", "invert")
 def says_lamp(path: Path) -> bool:
     """Whether a path is a project of a lamp."""
     return (path / "project.toml").is_file() and "lamp" in read(path / "project.toml")
+
+
+def asks_for_lamp(given: Mapping[str, Any], preset: str | None, config: Path | None) -> bool:
+    """Whether settings by path, those of a preset or those of a configuration are of a lamp."""
+    files = [*([presets.path_of(preset)] if preset else []), *([config] if config else [])]
+    return any(path.startswith("lamp.") for path in given) or any("lamp" in read(file, parameters=True) for file in files)
 
 
 def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Settings:

@@ -39,7 +39,7 @@ def new_project(
     Raises:
         InputError: invalid input.
     """
-    said = merged(given, preset, config, say)
+    said = _merged(given, preset, config, say)
     parameters = Parameters(said.pop("", {}))
     if parameters.elements is not None:  # those of the command line replace those of a configuration
         said["element"] = {"list": list(parameters.elements)}
@@ -78,9 +78,7 @@ def _with_picture(full: Settings, picture: Picture) -> Settings:
     return full.changed(target=full.target.changed(file=f"target{picture.suffix}", encoding=picture.encoding))
 
 
-def merged(
-    given: Mapping[str, Any], preset: str | None, config: Path | None, say: Callable[[str], None] = lambda text: None
-) -> Given:
+def _merged(given: Mapping[str, Any], preset: str | None, config: Path | None, say: Callable[[str], None]) -> Given:
     """The settings of preset, configuration and command line, with the contents of the files they name."""
     layers = [settings.read(presets.path_of(preset), parameters=True)] if preset else []
     if config:
