@@ -38,6 +38,7 @@ SMALL = {
         "CONVERGENCE_FORCE": "1",
     }.items()
 }
+OF_HEIGHT_FIELDS = [f"CAUSTIC_DESIGN_{name}" for name in ("RESOLUTION", "ITERATIONS", "LENS_SIZE", "THROW", "WAVES")]
 #: Lines that need what no chapter makes, and studies of minutes, which tests of their own run smaller.
 NEEDS_MORE = ("--verify", "--source-file led.tm25ray", "--study diffraction", "led.caustic --study light", "--explain")
 NEEDS_MORE += ("--tolerances", "--robust", "--day", "blank.caustic")
@@ -97,8 +98,12 @@ def test_the_commands_of_a_chapter_run(chapter, home, monkeypatch, capfd):
         where = few.index("2>") if "2>" in few else len(few)
         if "--screen" in few or "window-floor" in few or "sundial" in few:  # which say where the screen is
             monkeypatch.delenv("CAUSTIC_DESIGN_THROW")
+        if "--lamp" in few or "street" in few or "spot" in few:  # which have no settings of a height field
+            for name in OF_HEIGHT_FIELDS:
+                monkeypatch.delenv(name)
         status = cli.run(few[:where])
-        monkeypatch.setenv("CAUSTIC_DESIGN_THROW", SMALL["CAUSTIC_DESIGN_THROW"])
+        for name in OF_HEIGHT_FIELDS:
+            monkeypatch.setenv(name, SMALL[name])
         assert status == 0, f"caustic {shlex.join(arguments)}\n{capfd.readouterr().err}"
 
 

@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw
 
 from caustic_cli import cli, design
 from caustic_cli.config import presets, settings
+from caustic_cli.config.lamp import goal_of, lamp_of
 from caustic_cli.errors import InputError
 from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
@@ -31,6 +32,9 @@ def _quick(tmp_path, monkeypatch):
 def test_every_preset_is_a_whole_scene(name):
     said = settings.read(presets.path_of(name), parameters=True)
     full = complete(said, 1.0, Parameters(**said.pop("")))
+    if full.lamp is not None:
+        assert lamp_of(full).radius == 15.0 and goal_of(full).distance == full.screen.z
+        return
     scene = settings.build_scene(full)
     assert scene.screen.z == full.screen.z and dict(presets.rows())[name].endswith(".")
 

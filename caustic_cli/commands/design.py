@@ -33,7 +33,8 @@ class DesignOptions(options.Computation):
         Path,
         typer.Argument(
             metavar="TARGET",
-            help="The picture: an image file or a 2-D .npy of irradiance, - for standard input; with --resume, the project.",
+            help="The picture: an image file or a 2-D .npy of irradiance, - for standard input, or uniform or disc where there is"
+            " no such file; with --resume, the project.",
             show_default=False,
         ),
     ]
@@ -95,10 +96,15 @@ def run(asked: DesignOptions) -> None:
             compile_behind(["multigrid"], more=True)
     device = asked.start_torch()
 
+    from caustic_cli.config.lamp import asks_for_lamp  # noqa: PLC0415
     from caustic_cli.inverse import ranks  # noqa: PLC0415
     from caustic_cli.workflow import library  # noqa: PLC0415
     from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
+    if not asked.resume and asks_for_lamp(asked.given, asked.preset, asked.config):
+        with _saying_what_is_kept(path):
+            _design_lamp(asked, picture, path)
+        return
     if asked.plan:
         _print_plan(asked, picture)
         return
@@ -116,6 +122,28 @@ def run(asked: DesignOptions) -> None:
     say.table(lens.figures["project"], console.figures_rows(lens.figures))
     if asked.json:
         console.emit_json(lens.figures)
+
+
+def _design_lamp(asked: DesignOptions, picture: Any, path: Path) -> None:
+    """Design a lamp and print its figures.
+
+    Raises:
+        InputError: an option is given that belongs to a lens with a height field.
+    """
+    from caustic_cli.workflow import lamp  # noqa: PLC0415
+
+    if checks.rank_and_size()[1] > 1:
+        raise InputError("a lamp is designed by one process, and torchrun has started more")
+    if asked.device == "cuda":
+        raise InputError("a lamp is designed on the CPU: leave out --device cuda")
+    for name in ("movie", "error", "plan"):
+        if getattr(asked, name):
+            raise InputError(f"--{name} is for a lens before its light, not for a lamp around it")
+    how: dict[str, Any] = {"preset": asked.preset, "config": asked.config, "out": path, "force": asked.force, "say": asked.say}
+    figures = lamp.design(picture, asked.given, **how).figures
+    asked.say.table(figures["project"], lamp.rows(figures))
+    if asked.json:
+        console.emit_json(figures)
 
 
 def _check(asked: DesignOptions) -> None:

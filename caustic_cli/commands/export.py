@@ -45,7 +45,8 @@ class ExportOptions(options.OfDesign, options.Debugging):
             "--format",
             metavar="NAME[,NAME...]",
             help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items())
-            + ".  [default: what --out's suffix says; lighttools]",
+            + "; of a lamp stl, ply, obj, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's suffix says;"
+            " lighttools]",
         ),
     ] = None
     output: Annotated[
@@ -106,6 +107,9 @@ def run(asked: ExportOptions) -> None:
     if project is None:
         listed = ", ".join(f"{name} ({suffix})" for name, (suffix, _, _) in FORMATS.items())
         raise InputError(f"a project is needed, and a --format or an --out with its suffix, of {listed}")
+    if project.is_dir() and _is_lamp(project):
+        _export_lamp(asked, project)
+        return
     formats = _formats(asked)
     given = _given(asked, formats)
     most = MOST_BYTES if asked.max_size is None else options.size_in_bytes("--max-size", asked.max_size)
@@ -130,6 +134,43 @@ def run(asked: ExportOptions) -> None:
             say.table("milling", rows(figures["milling"]))
     if asked.json:
         console.emit_json(all_figures[0] if len(formats) == 1 else {"exports": all_figures})
+
+
+def _is_lamp(project: Path) -> bool:
+    """Whether a project holds a lamp."""
+    from caustic_cli.config.lamp import says_lamp  # noqa: PLC0415
+
+    options.require_project(project)
+    return says_lamp(project)
+
+
+def _export_lamp(asked: ExportOptions, path: Path) -> None:
+    """Write a lamp, or its light.
+
+    Raises:
+        InputError: an option is given that does not apply to lamps, or a format does not hold them.
+    """
+    from caustic_cli.project.project import Project  # noqa: PLC0415
+    from caustic_cli.workflow import lamp  # noqa: PLC0415
+
+    options.refuse_others(asked, ("format", "output", "samples", "milling"))
+    samples = tuple(options.both(options.counts("--samples", asked.samples))) if asked.samples else None
+    if asked.format is None:
+        suffix = "" if asked.output is None else asked.output.suffix.lower()
+        formats = [name for name, (own, _, _) in lamp.FORMATS.items() if own == suffix]
+        if not formats:
+            listed = ", ".join(f"{name} ({own})" for name, (own, _, _) in lamp.FORMATS.items())
+            raise InputError(f"of a lamp a --format is needed, or an --out with its suffix, of {listed}")
+    else:
+        formats = [name.strip() for name in asked.format.split(",")]
+    if asked.output and len(formats) > 1:
+        raise InputError("--out names one file; several formats are written beside each other under the project's own name")
+    project, found = Project.open(path), []
+    for name in formats:
+        found.append(lamp.export(project, name, asked.output, samples, asked.force, asked.say))
+        asked.say.result(f"{found[-1]['file']}: {found[-1]['bytes']:,} bytes")
+    if asked.json:
+        console.emit_json(found[0] if len(formats) == 1 else {"exports": found})
 
 
 def _formats(asked: ExportOptions) -> list[str]:

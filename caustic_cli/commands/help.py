@@ -19,6 +19,7 @@ GROUPS = {
     "Picture": ("target",),
     "Light source": ("source", "room"),
     "Lens": ("lens",),
+    "Lamp": ("lamp",),
     "Screen": ("screen", "second"),
     "Design": ("design",),
     "Effects": (),

@@ -9,7 +9,7 @@ import inspect
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -523,6 +523,24 @@ def rays(option: str, text: str) -> int:
     if value != int(value) or not 1 <= value <= 1e12:
         raise InputError(f"{option} must be a whole number 1 to 1e12 (2e6 is fine), got {text!r}")
     return int(value)
+
+
+def refuse_others(asked: Given, taken: Sequence[str]) -> None:
+    """Refuse options that a lamp does not have.
+
+    taken: names of those that it has, beside those of every command.
+
+    Raises:
+        InputError: naming one that was given.
+    """
+    common = {name for one in (Presentation, WithProgress, Debugging, OnDevice) for name in one.__annotations__}
+    others = [table.TABLE[path].option for path in getattr(asked, "given", {}) if not path.startswith("design.")]
+    names = [option.name for option in others if option is not None]
+    for name, value in vars(asked).items():
+        if name not in {*common, *taken, "given", "project", "say"} and value not in (getattr(type(asked), name, None), {}):
+            names.append(f"--{name.replace('_', '-')}")
+    if names:
+        raise InputError(f"{names[0]} is for a lens before its light; of a lamp (--lamp) it has no meaning")
 
 
 def require_project(path: Path, archives: bool = False) -> None:

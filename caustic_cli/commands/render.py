@@ -172,6 +172,7 @@ def run(asked: RenderOptions) -> None:
     options.require_project(asked.project, archives=True)
 
     from caustic_cli.config import tolerances as schema  # noqa: PLC0415
+    from caustic_cli.config.lamp import says_lamp  # noqa: PLC0415
     from caustic_cli.config.values import refuse_bad_options  # noqa: PLC0415
 
     refuse_bad_options(given)
@@ -183,6 +184,9 @@ def run(asked: RenderOptions) -> None:
     from caustic_cli.workflow.outputs.base import Request, Tracing  # noqa: PLC0415
     from caustic_cli.workflow.render import render  # noqa: PLC0415
 
+    if says_lamp(asked.project):
+        _render_lamp(asked, rays)
+        return
     tracing = Tracing(
         rays=rays,
         tolerance=asked.tolerance,
@@ -204,6 +208,26 @@ def run(asked: RenderOptions) -> None:
         console.emit_json(figures)
     if asked.verify and not figures["verify"]["agree"]:
         raise CausticError(f"the image and Mitsuba's disagree by more than noise; see {figures['verify']['image']}")
+
+
+#: Options that apply to lamps.
+OF_LAMPS = ("rays", "output", "npy")
+
+
+def _render_lamp(asked: RenderOptions, rays: int | None) -> None:
+    """Trace a lamp and print its figures.
+
+    Raises:
+        InputError: an option is given that belongs to a lens with a height field.
+    """
+    from caustic_cli.project.project import Project  # noqa: PLC0415
+    from caustic_cli.workflow import lamp  # noqa: PLC0415
+
+    options.refuse_others(asked, OF_LAMPS)
+    figures = lamp.render(Project.open(asked.project), rays, asked.seed, asked.output, asked.npy, asked.force, asked.say)
+    asked.say.table(str(asked.project), lamp.rows(figures))
+    if asked.json:
+        console.emit_json(figures)
 
 
 def _checked_size(asked: RenderOptions) -> list[int]:

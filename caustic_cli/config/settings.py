@@ -33,6 +33,7 @@ from caustic_cli.schema.table import (
     TABLE,
     DesignSettings,
     ElementSettings,
+    LampSettings,
     LensSettings,
     RoomSettings,
     ScreenSettings,
@@ -66,9 +67,13 @@ _TOKEN = re.compile(
 )
 
 
+#: The sections of a project that are not lists of tables.
+NAMES = ("source", "room", "lamp", "lens", "screen", "target", "second", "design")
+
+
 def _schema() -> dict[str, dict[str, Setting]]:
     """Keys of every section: those of the table, and in [source] those that source types define."""
-    found = {section: in_section(section) for section in ("source", "room", "lens", "screen", "target", "second", "design")}
+    found = {section: in_section(section) for section in NAMES}
     found["source"]["type"] = replace(found["source"]["type"], help=sources.in_words())
     found["source"] |= {key: Setting(f"source.{key}", *spec) for key, spec in sources.own_keys().items()}
     found["element"] = {}  # a list of tables, kept as the section's only key, "list"
@@ -277,6 +282,7 @@ class Settings:
     second: SecondSettings | None = None
     elements: tuple[ElementSettings, ...] = ()
     room: RoomSettings | None = None
+    lamp: LampSettings | None = None
 
     @classmethod
     def of(cls, given: Given) -> Self:
@@ -295,6 +301,7 @@ class Settings:
             SecondSettings.of(given["second"]) if "second" in given else None,
             tuple(map(ElementSettings, given.get("element", {}).get("list", ()))),
             RoomSettings.of(given["room"]) if "room" in given else None,
+            LampSettings.of(given["lamp"]) if "lamp" in given else None,
         )
 
     def changed(self, **sections: Any) -> Self:
@@ -326,17 +333,10 @@ def dump(settings: Settings) -> str:
         f"format_version = {FORMAT_VERSION}",
         f'created_by = "caustic {__version__}"',
     ]
-    for section in (
-        settings.source,
-        settings.room,
-        settings.lens,
-        settings.screen,
-        settings.target,
-        settings.second,
-        settings.design,
-    ):
+    for section in (getattr(settings, name) for name in NAMES):
         also = section.also if isinstance(section, SourceSettings) else ()
-        for table in () if section is None else (section, *also):
+        unused = section is None or (section is settings.source and not section)  # a lamp has no source
+        for table in () if unused else (section, *also):
             lines += ["", f"[[{table.section}]]" if also else f"[{table.section}]", *_assignments(table, SCHEMA[table.section])]
     for element in settings.elements:
         lines += ["", "[[element]]", *_assignments(element, ELEMENT)]
@@ -365,7 +365,7 @@ def tables_of(settings: Settings) -> Given:
             return {key: plain(one) for key, one in value.items()}
         return [plain(one) for one in value] if isinstance(value, tuple) else value
 
-    found = {name: plain(getattr(settings, name)) for name in ("source", "room", "lens", "screen", "target", "design", "second")}
+    found = {name: plain(getattr(settings, name)) for name in NAMES}
     if settings.elements:
         found["element"] = {"list": plain(settings.elements)}
     return {name: table for name, table in found.items() if table is not None}
@@ -443,7 +443,13 @@ def build_source(source: SourceSettings, type: str | None = None) -> Source:
 
 
 def build_scene(settings: Settings) -> Scene:
-    """The complete scene."""
+    """The complete scene.
+
+    Raises:
+        InputError: a value is out of range, or it is a lamp, which has no height field.
+    """
+    if settings.lamp is not None:
+        raise InputError("⟨lamp.radius⟩ makes a lamp, a lens around its light, which caustic design, render and export alone take")
     return Scene(
         build_source(settings.source),
         build_lens(settings.lens),

@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from caustic_cli.export import mesh
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_file
@@ -20,7 +22,11 @@ A_POINT = 3 * (DECIMALS + 4) + 2 * 25
 
 def write_obj(path: str | Path, *lens: Any, **density: Any) -> None:
     """Write the solid atomically; arguments and errors as in `write_ply`."""
-    vertices, faces = mesh.closed_mesh(*lens, **density)
+    write_mesh(path, *mesh.closed_mesh(*lens, **density))
+
+
+def write_mesh(path: str | Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write vertices (V, 3) mm and triangles (F, 3)."""
     with atomic_file(path) as file:
         file.write(f"# {CREATED}\n# millimetres\no lens\n".encode())
         file.writelines(rows(vertices.round(DECIMALS) + 0.0, f"v %.{DECIMALS}f %.{DECIMALS}f %.{DECIMALS}f\n"))

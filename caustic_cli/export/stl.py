@@ -35,7 +35,11 @@ def write_stl(path: str | Path, *lens: Any, **density: Any) -> None:
     Raises:
         InputError: as `closed_mesh`; points that coincide in float32; or the file cannot be written.
     """
-    vertices, faces = mesh.closed_mesh(*lens, **density)
+    write_mesh(path, *mesh.closed_mesh(*lens, **density))
+
+
+def write_mesh(path: str | Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write vertices (V, 3) mm and triangles (F, 3); errors as of `write_stl`."""
     vertices = vertices.astype("<f4")
     with atomic_file(path) as file:
         file.write(HEADER)

@@ -13,6 +13,7 @@ import numpy as np
 
 from caustic_cli.config.design import relative_to_initial
 from caustic_cli.config.exclusions import refuse_contradictions
+from caustic_cli.config.lamp import complete_lamp
 from caustic_cli.config.optional import (
     complete_elements,
     complete_network,
@@ -56,6 +57,8 @@ def complete(
     Raises:
         InputError: a value is out of range, or two contradict each other.
     """
+    if "lamp" in given:
+        return complete_lamp(given, by or {}, aspect)
     s, by = Settings.of(given), by or Parameters()
     room, s = s.room, s.changed(room=lit_by_sun(s.room, by))
     s = s.changed(source=complete_sunlight(s.source, s.room, check("lens.array", s.lens.array)))

@@ -54,6 +54,9 @@ def new_project(
             raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
         said["source"] = colours.filled(said.get("source", {}), picture)
     full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
+    if full.lamp is not None:
+        full = _with_picture(full, picture)
+        return Project(out, full, picture, uptodate.digest(full, picture)), said
     for key in ("index_range", "index_control", "index_layers"):
         if f"lens.{key}" in given and full.lens.gradient != "free":
             raise InputError(f"⟨lens.{key}⟩ belongs to ⟨+lens.gradient⟩ free")
@@ -64,10 +67,15 @@ def new_project(
     settings.refuse_unused(full.source, given, [stage.source for stage in full.design.stages])
     if goal.color and (beyond := colours.beyond_words(picture, settings.build_light(full))):
         say(beyond)
-    full = full.changed(target=full.target.changed(file=f"target{picture.suffix}", encoding=picture.encoding))
+    full = _with_picture(full, picture)
     full = attachments.named_in_project(full)
     asked = uptodate.digest(full, picture)
     return Project(out, full, picture, asked, without_waves=without_waves(full, "stages" in said.get("design", {}))), said
+
+
+def _with_picture(full: Settings, picture: Picture) -> Settings:
+    """Settings that name the picture's file in the project."""
+    return full.changed(target=full.target.changed(file=f"target{picture.suffix}", encoding=picture.encoding))
 
 
 def _merged(given: Mapping[str, Any], preset: str | None, config: Path | None, say: Callable[[str], None]) -> Given:

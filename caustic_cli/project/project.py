@@ -120,7 +120,8 @@ class Project:
             if goal.color:
                 given["source"] = colours.filled(given.get("source", {}), picture)
             full = complete(attachments.attached(attachments.located(given, path)), picture.aspect)
-            build_stages(full), build_options(full)  # validates the design, too
+            if full.lamp is None:
+                build_stages(full), build_options(full)  # validates the design, too
             return cls(path, full, picture, on_disk=True)
         except InputError as error:
             raise InputError(f"{path / TOML}: {plain(f'{error}')}") from error

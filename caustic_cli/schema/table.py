@@ -273,6 +273,30 @@ class RoomSettings(Section):
             default=90.0, why="windows are upright", option=Option("--slope", "DEG", BOTH))
 
 
+class LampSettings(Section):
+    """[lamp]: a lens around a light-emitting chip, instead of one in front of a source; of the other sections it takes the index,
+    the picture, the distance of the screen and the seed alone."""
+
+    section = "lamp"
+    radius: float | None = setting("design a lamp: a lens around a Lambertian chip at the origin that emits along +z, for all its"
+            " light; greatest distance of the free-form surface from the chip", "mm", *LENS, derived="no lamp",
+            option=Option("--lamp", "MM"))
+    inner: float | None = setting("radius of the hemisphere around the chip that is the inner side of the lens", "mm", *LENS,
+            derived="4/15 of lamp.radius, 2/15 with two free-form surfaces", option=Option("--lamp-inner", "MM"))
+    surfaces: int = setting("free-form surfaces: 1, around a hemisphere, or 2, which share the deflection; lamp.inner is then the"
+            " least radius of the inner one", low=1, high=2, default=1, why="one is cheaper to make", written=False,
+            option=Option("--lamp-surfaces", "1|2"))
+    wall: float = setting("least distance between hemisphere and free-form surface", "mm", *LENS, default=1.0, why="injection"
+            " moulding of acrylic", option=Option("--lamp-wall", "MM"))
+    chip: Pair = setting("full width and height of the chip, 0 for a point", "mm", 0.0, 1e6, default=[0.0, 0.0], why="the limit"
+            " that a small chip approaches", option=Option("--chip", "W[xH]"))
+    shape: str = setting("shape of the chip: rectangle or disc", choices=("rectangle", "disc"), default="rectangle", written=False,
+            option=Option("--chip-shape", "rectangle|disc"))
+    angles: Pair | None = setting("full width and height of the picture in the far field, its values being intensities: longitude"
+            " about the vertical and latitude (type A photometry)", "degrees", 0.0, 178.0, above=True, derived="a picture on a"
+            " screen", option=Option("--angles", "W[xH]"))
+
+
 class LensSettings(Section):
     """[lens]: the lens."""
 
@@ -526,8 +550,8 @@ class Parameters(Section):
             derived="300", option=Option("--throw", "MM"), speaks_for=("screen.z",), before="screen.z")
     screen_place: str | None = setting("part of a room as the screen, where the light meets it: floor:1m, ceiling:1m or wall:2m,"
             " which may have ,AZIMUTH of the picture's top or of the wall; or any plane, point=X,Y,Z;normal=X,Y,Z;up=X,Y,Z, the"
-            " normal towards the viewer, with room; before it for east, north and up",
-            derived="square to the light", option=Option("--screen", "PLACE"),
+            " normal towards the viewer, with room; before it for east, north and up; far, the far field of a lamp, with"
+            " lamp.angles", derived="square to the light", option=Option("--screen", "PLACE"),
             speaks_for=("screen.z", "screen.tilt", "screen.shift"), before="screen.z")
     screen_size: Pair | None = setting("full width and height of the screen; a single length keeps the picture's aspect ratio",
             "mm", derived="picture plus margin", option=Option("--screen-size", "W[xH]"), speaks_for=("screen.size",),
@@ -554,8 +578,8 @@ class Parameters(Section):
     rays: int | None = setting("number of rays of the last default stage", low=1, high=10**12, derived="by quality",
             option=Option("--rays", "N"), before="design.loss")
 # fmt: on
-SECTIONS: tuple[type[Section], ...] = (SourceSettings, RoomSettings, LensSettings, ScreenSettings, TargetSettings, SecondSettings)
-SECTIONS += (ElementSettings, DesignSettings, StageSettings)
+SECTIONS: tuple[type[Section], ...] = (SourceSettings, RoomSettings, LampSettings, LensSettings, ScreenSettings, TargetSettings)
+SECTIONS += (SecondSettings, ElementSettings, DesignSettings, StageSettings)
 
 
 def _listed() -> Iterator[Setting]:

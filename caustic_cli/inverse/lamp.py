@@ -1,0 +1,247 @@
+"""Design of a lamp: its free-form surface by transport, then by L-BFGS on the image of its light.
+
+    loss = rho^2 + w (1 - efficiency + distance beside the target + lack of margin to total reflection)
+
+rho     relative RMS error of the power on the pixels of the target and of an apron around it, the image divided by its own sum
+w       weight of the light that does not arrive, all light of the chip counting 1.  Where light is scarce, at the rim of the
+        hemisphere, both terms compete: it is large at first, so that light comes onto the target, and small in the last stage
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.effort import STANDARD, Effort
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.lbfgs import LBFGS
+from caustic_cli.inverse.parametrisation import InverseLaplacian
+from caustic_cli.inverse.refractor_transport import CELLS, transported
+from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.lamp import ChipRays, PointGrid, emissions, land, least_wall, through, through_point
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.surfaces.polarfield import PolarField
+from caustic_cli.scene import Screen
+from caustic_cli.scene.lamp import Chip, Goal, Lamp
+
+#: Squared cosine of the angle of exit below which a ray is near total reflection.
+MARGIN = 0.005
+#: Dark pixels around the target on which light beside it is seen; and the filter of the image.
+APRON, FILTER = 4, Filter("cosine", (3, 3))
+#: Degree of the spline.
+DEGREE = 3
+#: Points of a grid at which limits of two surfaces hold, weight of their squares, and the wall there over that to be kept.
+ROOM_POINTS, STIFF, SAFE = 8000, 3.0, 1.3
+#: Radius of the first inner surface, a sphere, over its least one.
+BEGIN = 4.0 / 3.0
+
+
+def pixels_of(goal: Goal, count: int) -> tuple[int, int]:
+    """About `count` nearly square pixels on a target: their numbers along both axes."""
+    across = max(2, round(math.sqrt(count * goal.size[0] / goal.size[1])))
+    return across, max(2, round(count / across))
+
+
+def wanted(goal: Goal, picture: np.ndarray, pixels: tuple[int, int]) -> Tensor:
+    """The part of the light wanted on each pixel, of sum 1: (n_x, n_y) float64.
+
+    picture: (a, b) irradiance on a plane, or intensity in the far field, any scale; [i, j] with i along +x.  In the far field the
+    solid angle of a pixel falls with the cosine of its latitude.
+
+    Raises:
+        InputError: it is black.
+    """
+    power = target_on_screen(picture, goal.size, Screen(goal.size, resolution=pixels)) * goal.shares(pixels)
+    return torch.from_numpy(power / power.sum())
+
+
+def directions_of(goal: Goal, pixels: tuple[int, int]) -> Tensor:
+    """Unit directions from the origin to the centres of pixels, (n_x n_y, 3)."""
+    axes = [((torch.arange(n, dtype=torch.float64) + 0.5) / n - 0.5) * s for n, s in zip(pixels, goal.size, strict=True)]
+    x, y = (c.reshape(-1) for c in torch.meshgrid(*axes, indexing="ij"))
+    if goal.far:
+        x, y = torch.deg2rad(x), torch.deg2rad(y)
+        return torch.stack([torch.sin(x) * torch.cos(y), torch.sin(y), torch.cos(x) * torch.cos(y)], 1)
+    found = torch.stack([x, y, torch.full_like(x, goal.distance)], 1)
+    return found / found.norm(dim=1, keepdim=True)
+
+
+class LampObjective:
+    """The loss of control values, (n, m) or (2, n, m) (`optics.lamp.sides`), for fixed rays: of a point those of a grid, of a
+    chip a Sobol sequence.
+
+    Args:
+        target: (n_x, n_y) as of `wanted`.
+        rays: about; seed: of a chip's.
+        weight: w, see the module.
+    """
+
+    def __init__(self, lamp: Lamp, goal: Goal, field: PolarField, target: Tensor, rays: int, seed: int = 0, weight: float = 0.1):
+        self.goal, self.weight = goal, weight
+        point = lamp.chip.shape == "point"
+        self.rays: Sequence[PointGrid | ChipRays] = PointGrid.of(field, rays) if point else list(emissions(lamp.chip, rays, seed))
+        self.through = partial(through_point if point else through, lamp, field)
+        self.screen = Screen(goal.size, resolution=(target.shape[0], target.shape[1])).grown((APRON, APRON))
+        smooth = FILTER.smooth(torch.nn.functional.pad(target.double(), (APRON,) * 4))
+        self.target = smooth / smooth.sum()
+        self.lit = float((target > 0).sum())
+        self.splat = backend_for("cpu").splat
+        self.room = Room(lamp, field) if lamp.surfaces == 2 else None
+
+    def terms(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """rho^2, efficiency (light on target and apron), mean distance beside the target, and lack of margin."""
+        image, distance, lack = (sum(part) for part in zip(*(self._see(rays, values) for rays in self.rays), strict=True))
+        efficiency = image.sum()
+        residual = image / efficiency - self.target
+        return (residual * residual).sum() * self.lit, efficiency, distance, lack
+
+    def _see(self, rays, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Contributions of some rays to the image, to the distance beside the target and to the lack of margin."""
+        light = self.through(rays, values)
+        x, y, ahead = land(self.goal, light)
+        image, _ = self.splat(x, y, torch.where(ahead, light.power, torch.zeros_like(x)), self.screen, FILTER)
+        beside = [(c.abs() / (0.5 * s) - 1.0).clamp_min(0.0) for c, s in zip((x, y), self.goal.size, strict=True)]
+        distance = beside[0] + beside[1]
+        lack = (1.0 - light.spare / MARGIN).clamp_min(0.0)
+        return image, (light.power * (distance / (1.0 + distance))).sum(), (rays.power * lack).sum()
+
+    def __call__(self, values: Tensor) -> Tensor:
+        square, efficiency, distance, lack = self.terms(values)
+        loss = square + self.weight * (1.0 - efficiency + distance + lack)
+        return loss if self.room is None else loss + self.room.lack(values)
+
+
+class Room:
+    """Limits of two free-form surfaces, at the points of a grid: a wall between them, estimated by the radial distance and the
+    slopes, the least radius of the inner one, and the greatest of the outer one."""
+
+    def __init__(self, lamp: Lamp, field: PolarField):
+        self.lamp, self.grids = lamp, PointGrid.of(field, ROOM_POINTS)
+
+    def lack(self, values: Tensor) -> Tensor:
+        """Sum of squares of what lacks, relative to each limit, per point, times STIFF."""
+        total, count, lamp = torch.zeros((), dtype=torch.float64), 0, self.lamp
+        for grid in self.grids:
+            hits = [grid.hits(net) for net in values]
+            inner, outer = (sum(c * c for c in hit.point).sqrt() for hit in hits)
+            steep = torch.maximum(*(hit.p * hit.p + hit.q * hit.q for hit in hits))
+            wall = (outer - inner) / (1.0 + steep).sqrt()
+            lacks = (1.0 - wall / (SAFE * lamp.wall), 1.0 - inner / lamp.inner, outer / lamp.radius - 1.0)
+            total = total + sum((lack.clamp_min(0.0) ** 2).sum() for lack in lacks)
+            count += len(inner)
+        return STIFF / count * total
+
+
+def refine(
+    objective: LampObjective, values: Tensor, iterations: int, on_iteration: Callable[[int, float], None] = lambda k, loss: None
+) -> Tensor:
+    """Control values after at most so many iterations of L-BFGS, in the coordinates of the inverse Laplacian, from initial ones.
+
+    on_iteration: called with the number of iterations and the loss.
+    """
+    spread = InverseLaplacian(values)
+
+    def evaluate(x: Tensor) -> tuple[float, Tensor]:
+        y = x.view(values.shape).clone().requires_grad_()
+        loss = objective(values + spread(y))
+        (g,) = torch.autograd.grad(loss, y)
+        return float(loss.detach()), g.reshape(-1)
+
+    method = LBFGS(evaluate, torch.zeros(values.numel(), dtype=torch.float64))
+    for k in range(iterations):
+        if not method.step() or method.f is None:
+            break
+        on_iteration(k + 1, method.f)
+    with torch.no_grad():
+        return values + spread(method.x.view(values.shape))
+
+
+def initial_lamp(lamp: Lamp, goal: Goal, field: PolarField, picture: np.ndarray, cells: int = CELLS) -> Tensor:
+    """Control values (n, m) of log r by transport of the light of a point to the target, see `refractor_transport`.
+
+    cells: of the light along u and v; the target has as many directions.
+    """
+    pixels = pixels_of(goal, round(0.25 * math.pi * cells * cells))
+    power = wanted(goal, picture, pixels).reshape(-1)
+    lit = power > 0
+    return transported(field, directions_of(goal, pixels)[lit], power[lit], lamp.index, lamp.radius, cells)
+
+
+def field_of(effort: Effort) -> PolarField:
+    """The spline spaces of a design."""
+    return PolarField.uniform((effort.lamp_control,) * 2, (DEGREE,) * 2)
+
+
+def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Lamp, tuple[int, int, int, float]]]:
+    """The stages of a design, each with the lamp that it refines: the lamp itself, with one surface or with a point as its chip."""
+    point = replace(lamp, chip=Chip())
+    if lamp.surfaces == 2:
+        found = [(replace(point, surfaces=1), effort.lamp_stages[0]), *((point, stage) for stage in effort.two_stages)]
+    else:
+        found = [(point, stage) for stage in effort.lamp_stages]
+    if lamp.chip.shape == "point":
+        return found
+    kept = 3 if lamp.surfaces == 2 else 2
+    return [*found[:kept], *((lamp, stage) for stage in effort.chip_stages)]
+
+
+def design_lamp(
+    lamp: Lamp,
+    goal: Goal,
+    picture: np.ndarray,
+    *,
+    effort: Effort = STANDARD,
+    seed: int = 0,
+    on_iteration: Callable[[int, int, float], None] = lambda stage, k, loss: None,
+) -> Tensor:
+    """The surfaces that send the light of a chip to a picture: control values of log r, r in mm, over the spline spaces `field_of`,
+    (n, m) of one or (2, n, m) of two (`optics.lamp.sides`).
+
+    Args:
+        picture: as of `wanted`.
+        seed: of a chip's rays.
+        on_iteration: called with the number of the stage, that of iterations in it and the loss.
+
+    Raises:
+        InputError: the picture is black, or the surfaces come too near to each other.
+    """
+    field = field_of(effort)
+    values = initial_lamp(lamp, goal, field, picture, effort.lamp_cells)
+    refuse_thin(lamp, field, values)
+    for k, (refined, (pixels, rays, iterations, weight)) in enumerate(stages_of(lamp, effort)):
+        if refined.surfaces == 2 and values.ndim == 2:
+            values = torch.stack([field.sphere(BEGIN * lamp.inner), values])
+        target = wanted(goal, picture, pixels_of(goal, pixels))
+        objective = LampObjective(refined, goal, field, target, rays, stream(seed, f"stage {k}"), weight)
+        values = refine(objective, values, iterations, partial(on_iteration, k))
+    refuse_thin(lamp, field, values)
+    return values
+
+
+def refuse_thin(lamp: Lamp, field: PolarField, values: Tensor) -> None:
+    """Refuse surfaces that come nearer to each other than the least wall.
+
+    Raises:
+        InputError: they do; of one surface with the radius with which it would not.
+    """
+    least = least_wall(lamp, field, values)
+    if least >= lamp.wall:
+        return
+    if values.ndim == 3:
+        raise InputError(
+            f"the two free-form surfaces come within {least:.3g} mm of each other, and ⟨lamp.wall⟩ must be {lamp.wall:g} mm: a"
+            " larger ⟨+lamp.radius⟩ or a smaller ⟨+lamp.inner⟩ is needed"
+        )
+    needed = lamp.radius * (lamp.inner + lamp.wall) / (lamp.inner + least)
+    raise InputError(
+        f"the free-form surface comes within {least:.3g} mm of the hemisphere of {lamp.inner:g} mm, and the wall must be"
+        f" {lamp.wall:g} mm: ⟨lamp.radius⟩ of {math.ceil(10.1 * needed) / 10:g} mm or more, or a smaller ⟨+lamp.inner⟩, is needed"
+    )

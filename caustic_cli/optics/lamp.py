@@ -1,0 +1,263 @@
+"""Light of a chip through the lens of a lamp: emission, both refractions, and where it goes.
+
+A Lambertian emitter sends equal flux into equal areas of the orthographic disc (d_x, d_y), d_x^2 + d_y^2 <= 1: of the solid angle
+dw it is cos(theta) dw / pi.  In stereographic coordinates that is
+
+    dPhi = 4 (1 - rho^2) / (pi (1 + rho^2)^3) du dv,
+
+so that the light of a point can also be sampled on a tensor grid of (u, v), on which a spline is two products of matrices.
+
+The power of every ray is booked as transmitted, reflected at either surface by Fresnel, totally reflected, or missed; it is not
+followed any further when reflected.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from caustic_cli.optics.interface import reflectance, refract
+from caustic_cli.optics.sampling import SOBOL_RAYS, Sample, Sampler, numbers
+from caustic_cli.optics.surfaces.polarfield import (
+    PolarField,
+    PolarHit,
+    Vectors,
+    frame,
+    from_frame,
+    polar_hit,
+    stereographic,
+    to_frame,
+)
+from caustic_cli.optics.tolerances import LEAST_COSINE
+from caustic_cli.scene.lamp import Chip, Goal, Lamp
+
+#: Causes for which light is lost, in the order of their occurrence.
+LOSSES = ("inner_fresnel", "missed", "total_internal_reflection", "outer_fresnel")
+#: Least component along z of light that is followed to a plane: flatter light lands beyond 50 distances from the axis.
+SHALLOW = 0.02
+#: Points of a path within the lens at which it is tested against the inner surface.
+PROBES = 3
+#: Rays traced at a time.
+CHUNK = 1 << 17
+_DEGREE = 180.0 / math.pi
+
+
+class ChipRays(NamedTuple):
+    """Rays as emitted: origins on the chip, mm, unit directions, and power, of sum 1; (N,) each."""
+
+    origin: Vectors
+    direction: Vectors
+    power: Tensor
+
+
+class LampLight(NamedTuple):
+    """Light behind the lens.
+
+    point: where it left the surface, mm; direction: unit vectors, meaningless for rays of power 0; power: of each ray; lost: power
+    by cause (`LOSSES`), whose sum with that of `power` is the power emitted; spare: squared cosine of the angle at which each ray
+    leaves, or would leave if it is totally reflected (negative).
+    """
+
+    point: Vectors
+    direction: Vectors
+    power: Tensor
+    lost: dict[str, Tensor]
+    spare: Tensor
+
+
+def concentric(s: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Points of the unit disc, of equal area for equal area of the unit square (Shirley and Chiu, J. Graphics Tools 2, 1997)."""
+    a, b = 2.0 * s - 1.0, 2.0 * t - 1.0
+    wide = a.abs() > b.abs()
+    r = torch.where(wide, a, b)
+    safe = torch.where(r == 0, torch.ones_like(r), r)
+    angle = torch.where(wide, 0.25 * math.pi * b / safe, 0.5 * math.pi - 0.25 * math.pi * a / safe)
+    return r * torch.cos(angle), r * torch.sin(angle)
+
+
+def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
+    """About `count` rays of equal power, CHUNK at a time: stratified ones of a point, a Sobol sequence of a wider chip."""
+    point, side = chip.shape == "point", max(1, round(math.sqrt(count)))
+    total = side * side if point else min(count, SOBOL_RAYS)
+    for start in range(0, total, CHUNK):
+        stop = min(start + CHUNK, total)
+        if point:
+            s, t = numbers("stratified", (side, side), seed, 2, start, stop)
+            x = y = torch.zeros_like(s)
+        else:
+            s, t, k, m = numbers("sobol", (1, 1), seed, 4, start, stop)
+            x, y = (2.0 * k - 1.0, 2.0 * m - 1.0) if chip.shape == "rectangle" else concentric(k, m)
+            x, y = 0.5 * chip.size[0] * x, 0.5 * chip.size[1] * y
+        dx, dy = concentric(s, t)
+        dz = (1.0 - dx * dx - dy * dy).clamp_min(0.0).sqrt()
+        yield ChipRays((x, y, torch.zeros_like(x)), (dx, dy, dz), torch.full_like(dx, 1.0 / total))
+
+
+class PointGrid:
+    """Rows of a tensor grid of directions (u, v) of the light of a point, without the corners that it does not reach.
+
+    u, v: (N,) coordinates of the directions; power: (N,), of sum 1 over all rows.
+    """
+
+    def __init__(self, field: PolarField, sample: Sample):
+        u, v = torch.meshgrid(2.0 * sample.u - 1.0, 2.0 * sample.v - 1.0, indexing="ij")
+        self.lit = (u * u + v * v < 1.0).reshape(-1).nonzero()[:, 0]
+        self.u, self.v = u.reshape(-1)[self.lit], v.reshape(-1)[self.lit]
+        rho2 = self.u * self.u + self.v * self.v
+        self.power = (1.0 - rho2) / (1.0 + rho2) ** 3
+        self._surface = field.net.prepare(sample, torch.float64)
+
+    @classmethod
+    def of(cls, field: PolarField, count: int) -> list[PointGrid]:
+        """About `count` rays, CHUNK at a time: small tensors stay in the cache of the processor."""
+        sampler = Sampler.of_size("grid", max(1, round(count * 4.0 / math.pi)))
+        grids = [cls(field, sample) for sample in sampler.chunks(CHUNK)]
+        total = sum(float(grid.power.sum()) for grid in grids)
+        for grid in grids:
+            grid.power /= total
+        return grids
+
+    def hits(self, values: Tensor) -> PolarHit:
+        """`PolarField.from_origin` in these directions."""
+        g, gu, gv = (c.reshape(-1).index_select(0, self.lit) for c in self._surface(values))
+        return polar_hit(self.u, self.v, g, gu, gv)
+
+
+def sides(values: Tensor) -> tuple[Tensor | None, Tensor]:
+    """Control values (n, m) of the inner surface, None for a hemisphere, and of the outer one, from those of a lamp: (n, m) of the
+    outer surface, or (2, n, m) of both."""
+    return (None, values) if values.ndim == 2 else (values[0], values[1])
+
+
+def least_wall(lamp: Lamp, field: PolarField, values: Tensor) -> float:
+    """Least distance of the two surfaces, mm; of two free-form ones between points of `PolarField.extent`; negative where the outer
+    one is nearer to the origin than the hemisphere."""
+    inner, outer = sides(values)
+    if inner is None:
+        return field.extent(outer)[0] - lamp.inner
+    one, other = (np.stack([c.numpy() for c in field.points(net.detach(), *field.sampled())], 1) for net in (inner, outer))
+    apart = float((np.linalg.norm(other, axis=1) - np.linalg.norm(one, axis=1)).min())  # along radii: an upper bound
+    return apart if apart <= 0 else min(apart, float(cKDTree(one).query(other, distance_upper_bound=apart)[0].min()))
+
+
+def through_point(lamp: Lamp, field: PolarField, rays: PointGrid, values: Tensor) -> LampLight:
+    """Light of a point at the origin through the lens; differentiable by the control values of log r, see `sides`."""
+    inner, outer = sides(values)
+    if inner is None:
+        return _from_point(lamp, rays.hits(outer), rays.power)
+    return _between(lamp, field, (inner, outer), rays.hits(inner), _along(rays.power), rays.power)
+
+
+def _along(like: Tensor) -> Vectors:
+    """The direction of the frame's axis, for as many rays."""
+    zero = torch.zeros_like(like)
+    return zero, zero, zero + 1.0
+
+
+def _from_point(lamp: Lamp, hit: PolarHit, power: Tensor) -> LampLight:
+    """Light of the origin, which meets the hemisphere at normal incidence and the surface along the frame's axis."""
+    kept = 1.0 - ((lamp.index - 1.0) / (lamp.index + 1.0)) ** 2
+    return _leave(
+        lamp, hit, _along(power), kept * power, {"inner_fresnel": (1.0 - kept) * power, "missed": torch.zeros_like(power)}
+    )
+
+
+def through(lamp: Lamp, field: PolarField, rays: ChipRays, values: Tensor) -> LampLight:
+    """Light of a chip through the lens; differentiable by the control values of log r, see `sides`."""
+    inner, outer = sides(values)
+    if lamp.chip.shape == "point":
+        at = stereographic(*rays.direction)
+        if inner is None:
+            return _from_point(lamp, field.from_origin(outer, *at), rays.power)
+        return _between(lamp, field, (inner, outer), field.from_origin(inner, *at), _along(rays.power), rays.power)
+    hit = _on_hemisphere(lamp, rays) if inner is None else field.intersect(inner, rays.origin, rays.direction)
+    local = to_frame(frame(hit.u, hit.v), rays.direction)
+    return _between(lamp, field, (inner, outer), hit, local, rays.power)
+
+
+def _on_hemisphere(lamp: Lamp, rays: ChipRays) -> PolarHit:
+    """Where rays meet the hemisphere: all do."""
+    (x, y, z), (dx, dy, dz), radius = rays.origin, rays.direction, lamp.inner
+    along = x * dx + y * dy + z * dz
+    t = (along * along + (radius * radius - (x * x + y * y + z * z))).sqrt() - along  # the origin lies within: one root
+    point, flat = (x + t * dx, y + t * dy, z + t * dz), torch.zeros_like(t)
+    return PolarHit(point, *stereographic(*point), flat, flat, torch.ones_like(t, dtype=torch.bool))
+
+
+def _between(
+    lamp: Lamp, field: PolarField, surfaces: tuple[Tensor | None, Tensor], hit: PolarHit, local: Vectors, power: Tensor
+) -> LampLight:
+    """Refraction at the inner surface, and what follows; local: directions in front of it, in the frames of the points.
+
+    Without derivatives, light that meets a free-form inner surface again, from within the lens, is booked as missed.
+    """
+    zero, (inner, outer) = torch.zeros_like(power), surfaces
+    met, local = _met(hit, local)
+    out, _, c, s = refract(local, hit.p, hit.q, 1.0 / lamp.index)
+    arriving = torch.where(met, power, zero)
+    reflected = arriving * reflectance("exact", c, s, 1.0 / lamp.index)
+    direction = from_frame(frame(hit.u, hit.v), out)
+    further = field.intersect(outer, hit.point, direction)
+    if inner is not None and not torch.is_grad_enabled():  # in a judgement; a design has a wall instead
+        again = _meets_again(field, inner, hit.point, further.point)
+        further = further._replace(valid=further.valid & ~again)
+    lost = {"inner_fresnel": reflected, "missed": power - arriving}
+    return _leave(lamp, further, to_frame(frame(further.u, further.v), direction), arriving - reflected, lost)
+
+
+def _meets_again(field: PolarField, inner: Tensor, start: Vectors, end: Vectors) -> Tensor:
+    """Whether straight paths within the lens lie within the inner surface at one of PROBES points between their ends."""
+    with torch.no_grad():
+        found = torch.zeros_like(start[0], dtype=torch.bool)
+        for k in range(1, PROBES + 1):
+            x, y, z = (a + k / (PROBES + 1) * (b - a) for a, b in zip(start, end, strict=True))
+            g = field.net.evaluate(inner, *stereographic(x, y, z))[0]
+            found |= 0.5 * (x * x + y * y + z * z).log() < g
+        return found
+
+
+def _met(hit: PolarHit, local: Vectors) -> tuple[Tensor, Vectors]:
+    """Whether rays meet a surface from within, and their directions, masked where they do not, which keeps NaN out of gradients."""
+    met = hit.valid & (local[2] - hit.p * local[0] - hit.q * local[1] > LEAST_COSINE)
+    if bool(met.all()):
+        return met, local
+    (x, y, z), zero = local, torch.zeros_like(hit.u)
+    return met, (torch.where(met, x, zero - hit.p), torch.where(met, y, zero - hit.q), torch.where(met, z, zero + 1.0))
+
+
+def _leave(lamp: Lamp, hit: PolarHit, local: Vectors, power: Tensor, lost: dict[str, Tensor]) -> LampLight:
+    """Refraction at the free-form surface; local: directions within the lens, in the frames of the points."""
+    n, zero = lamp.index, torch.zeros_like(power)
+    met, local = _met(hit, local)
+    out, passes, c, s = refract(local, hit.p, hit.q, n)
+    square = 1.0 + hit.p * hit.p + hit.q * hit.q
+    spare = 1.0 - n * n * (1.0 - c * c / square)
+    reflected = reflectance("exact", c, s, n)
+    passes = passes & met
+    arriving = torch.where(met, power, zero)
+    leaving = torch.where(passes, power * (1.0 - reflected), zero)
+    lost = lost | {
+        "missed": lost["missed"] + (power - arriving),
+        "total_internal_reflection": torch.where(met & ~passes, power, zero),
+        "outer_fresnel": torch.where(passes, power * reflected, zero),
+    }
+    return LampLight(hit.point, from_frame(frame(hit.u, hit.v), out), leaving, lost, torch.where(met, spare, zero + 1.0))
+
+
+def land(goal: Goal, light: LampLight) -> tuple[Tensor, Tensor, Tensor]:
+    """Coordinates of the light on the target, mm or degrees, and whether it travels towards it.
+
+    Light towards z <= 0 never meets a plane: it has the coordinates of a shallow ray.
+    """
+    (x, y, z), (dx, dy, dz) = light.point, light.direction
+    if goal.far:
+        return torch.atan2(dx, dz) * _DEGREE, torch.asin(dy.clamp(-1.0 + 1e-12, 1.0 - 1e-12)) * _DEGREE, dz > 0
+    ahead = dz > SHALLOW
+    t = (goal.distance - z) / torch.where(ahead, dz, torch.full_like(dz, SHALLOW))
+    return x + t * dx, y + t * dy, ahead

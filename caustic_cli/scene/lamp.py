@@ -1,0 +1,135 @@
+"""A lamp: a lens around a light-emitting chip, and where its light is wanted.
+
+The chip lies in the plane z = 0 with its centre at the origin, and emits into z > 0 by Lambert's law.  The lens lies between a
+hemisphere about the origin, which does not deflect the light of the chip's centre, or a second free-form surface, and a free-form
+surface; its base is the ring between the two in the plane z = 0.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+
+SHAPES = ("point", "disc", "rectangle")
+#: Widest target in the far field, degrees, along x and y: a lamp emits into z > 0.
+WIDEST = 178.0
+#: Largest ratio of its sides, and least distance of a plane target in radii of the lens.
+OBLONG, NEAREST = 100.0, 2.0
+
+
+@dataclass(frozen=True)
+class Chip:
+    """A Lambertian emitter.
+
+    Raises:
+        InputError: an unknown shape, or a size that does not belong to it.
+    """
+
+    #: point, disc (an ellipse where width and height differ) or rectangle.
+    shape: str = "point"
+    #: Full width and height, mm; 0 for a point.
+    size: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self):
+        if self.shape not in SHAPES:
+            raise InputError(f"the shape of a chip must be one of {', '.join(SHAPES)}, got {self.shape!r}")
+        if not all(math.isfinite(s) and s >= 0 for s in self.size):
+            raise InputError(f"the size of a chip must be finite and not negative, got {self.size}")
+        if (self.shape == "point") != (self.size == (0.0, 0.0)) or (min(self.size) == 0 < max(self.size)):
+            raise InputError(
+                f"a {self.shape} has {'no size' if self.shape == 'point' else 'two sizes above 0 mm'}, got {self.size}"
+            )
+
+    @property
+    def reach(self) -> float:
+        """Largest distance of its points from the origin, mm."""
+        return 0.5 * (math.hypot(*self.size) if self.shape == "rectangle" else max(self.size))
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Where the light is wanted: a rectangle centred on the axis, of a plane z = distance, or of angles in the far field.
+
+    Angles are those of type A photometry: along x the longitude about the y axis, atan2(x, z), along y the latitude, asin y.
+
+    Raises:
+        InputError: out of range.
+    """
+
+    #: Full width and height, mm on the plane or degrees in the far field.
+    size: tuple[float, float]
+    #: Of the plane, mm; inf for the far field.
+    distance: float = math.inf
+
+    def __post_init__(self):
+        if not all(0 < s < math.inf for s in self.size):
+            raise InputError(f"width and height of a target must be greater than 0, got {self.size}")
+        if max(self.size) > OBLONG * min(self.size):
+            raise InputError(
+                f"a target of a lamp is at most {OBLONG:g} times as long as wide, got {self.size[0]:g} x {self.size[1]:g}"
+            )
+        if not self.distance > 0:
+            raise InputError(f"the distance of a target must be greater than 0 mm, or inf, got {self.distance}")
+        if self.far and max(self.size) > WIDEST:
+            raise InputError(f"a target in the far field is at most {WIDEST:g} degrees wide and high, got {self.size}")
+
+    @property
+    def far(self) -> bool:
+        """Whether it is in the far field."""
+        return math.isinf(self.distance)
+
+    def shares(self, pixels: tuple[int, int]) -> np.ndarray:
+        """Part of each pixel in the area of a plane target, or in the solid angle of one in the far field: (n_x, n_y), of sum 1."""
+        across, along = np.ones(pixels[0]), np.ones(pixels[1])
+        if self.far:
+            along = np.diff(np.sin(np.radians(self.size[1] * (np.arange(pixels[1] + 1) / pixels[1] - 0.5))))
+        return np.outer(across / across.sum(), along / along.sum())
+
+    @property
+    def unit(self) -> str:
+        """Of its size."""
+        return "degrees" if self.far else "mm"
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """The lens around the chip, but for its free-form surface.
+
+    Raises:
+        InputError: out of range, or the chip does not fit into the hemisphere.
+    """
+
+    chip: Chip = field(default_factory=Chip)
+    #: Refractive index.
+    index: float = 1.49
+    #: Radius of the hemisphere around the chip, mm.
+    inner: float = 4.0
+    #: Greatest distance of the free-form surface from the chip's centre, mm, and least distance from the hemisphere.
+    radius: float = 15.0
+    wall: float = 1.0
+    #: Number of free-form surfaces: with 2 the inner side is one instead of the hemisphere, and `inner` its least radius.
+    surfaces: int = 1
+
+    def __post_init__(self):
+        if self.surfaces not in (1, 2):
+            raise InputError(f"a lamp has 1 or 2 free-form surfaces, got {self.surfaces!r}")
+        if not 1.0 < self.index <= 5.0:
+            raise InputError(f"⟨lens.index⟩ of a lamp must be greater than 1 and at most 5, got {self.index!r}")
+        if not self.chip.reach < self.inner < math.inf:
+            raise InputError(
+                f"⟨lamp.inner⟩ must be greater than the radius of the chip, {self.chip.reach:g} mm, got {self.inner:g} mm"
+            )
+        if not (self.wall > 0 and self.inner + self.wall < self.radius < math.inf):
+            raise InputError(
+                f"⟨lamp.radius⟩ must be greater than ⟨+lamp.inner⟩ and ⟨+lamp.wall⟩ together, {self.inner + self.wall:g} mm, got"
+                f" {self.radius:g} mm"
+            )
+
+    @property
+    def uncoated_limit(self) -> float:
+        """Largest fraction of the light that can leave without coatings: (1 - R)^2, R = ((n - 1) / (n + 1))^2."""
+        return (1.0 - ((self.index - 1.0) / (self.index + 1.0)) ** 2) ** 2

@@ -1,0 +1,149 @@
+"""Evaluation of a lamp by independent rays: where all light of the chip goes, and how well it fits the target.
+
+All figures are fractions of the light that the chip emits.  Errors are corrected for the noise of the rays: with images A and B of
+two independent halves, divided by the target and by their means, the mean of (A - 1) (B - 1) is the squared error without bias
+(compare `studies.noise`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.ndimage import minimum_filter
+from torch import Tensor
+
+from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.lamp import LOSSES, LampLight, emissions, land, least_wall, sides, through
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.surfaces.polarfield import PolarField
+from caustic_cli.scene import Screen
+from caustic_cli.scene.lamp import Goal, Lamp
+
+#: Rays of an evaluation.
+RAYS = 4_000_000
+#: Part of the smaller side of the target that is left out along its edges for the error of the interior.
+BORDER = 0.025
+#: A pixel of a picture without shades counts as lit entirely if it has more than this part of the greatest density.
+LIT = 0.999
+
+
+class LampImage(NamedTuple):
+    """Light on the target, fractions of that emitted.
+
+    image: (n_x, n_y), on given pixels; coarse: on fewer of them, for their least value; halves: the image of either half of the
+    rays; lost: by cause; rays: their number.
+    """
+
+    image: np.ndarray
+    coarse: np.ndarray
+    halves: tuple[np.ndarray, np.ndarray]
+    lost: dict[str, float]
+    rays: int
+
+
+def traced(lamp: Lamp, field: PolarField, values: Tensor, rays: int, seed: int) -> Iterator[tuple[int, LampLight]]:
+    """Light behind the lens of two independent halves of about `rays` rays of sum 1 each, in parts: number of the half, light."""
+    for half in (0, 1):
+        for part in emissions(lamp.chip, max(1, rays // 2), stream(seed, f"lamp {half}")):
+            with torch.no_grad():
+                yield half, through(lamp, field, part, values)
+
+
+def lamp_image(
+    lamp: Lamp,
+    goal: Goal,
+    field: PolarField,
+    values: Tensor,
+    pixels: tuple[int, int],
+    coarse: tuple[int, int] = (2, 2),
+    rays: int = RAYS,
+    seed: int = 0,
+) -> LampImage:
+    """Trace a lamp with about `rays` independent rays, each counted on the pixel where it lands."""
+    screens, splat = [Screen(goal.size, resolution=n) for n in (pixels, coarse)], backend_for("cpu").splat
+    halves, fewer = torch.zeros(2, *pixels, dtype=torch.float64), torch.zeros(coarse, dtype=torch.float64)
+    lost, count = dict.fromkeys((*LOSSES, "elsewhere"), 0.0), 0
+    for half, light in traced(lamp, field, values, rays, seed):
+        x, y, ahead = land(goal, light)
+        arriving = torch.where(ahead, light.power, torch.zeros_like(light.power))
+        image, outside = splat(x, y, arriving, screens[0], Filter())
+        halves[half] += image
+        fewer += 0.5 * splat(x, y, arriving, screens[1], Filter())[0]
+        for cause, power in light.lost.items():
+            lost[cause] += 0.5 * float(power.sum())
+        lost["elsewhere"] += 0.5 * float(outside + (light.power - arriving).sum())
+        count += len(light.power)
+    one, other = halves.numpy()
+    return LampImage(0.5 * (one + other), fewer.numpy(), (one, other), lost, count)
+
+
+def relative_rms(halves: tuple[np.ndarray, np.ndarray], target: np.ndarray, where: np.ndarray) -> float | None:
+    """Root mean square of the relative deviation of an image from its target over some pixels, corrected for noise; None for none.
+
+    The standard deviation of the illuminance over its mean where the target is uniform."""
+    if not where.any() or not all(half[where].sum() > 0 for half in halves):
+        return None
+    one, other = (half[where] / target[where] for half in halves)
+    return math.sqrt(max(0.0, float(((one / one.mean() - 1.0) * (other / other.mean() - 1.0)).mean())))
+
+
+def lamp_figures(
+    lamp: Lamp,
+    goal: Goal,
+    field: PolarField,
+    values: Tensor,
+    target: np.ndarray,
+    coarse: np.ndarray,
+    *,
+    shaded: bool = False,
+    rays: int = RAYS,
+    seed: int = 0,
+) -> tuple[LampImage, dict[str, Any]]:
+    """Figures of a lamp by independent rays.
+
+    Args:
+        target: (n_x, n_y) part of the light wanted on each pixel; coarse: the same on fewer pixels, for the uniformity.
+        shaded: whether the picture has more shades than lit and dark: otherwise only pixels that are lit entirely are compared.
+
+    Returns:
+        the image, and of_source: light on the target; relative_rms: over all pixels of the picture; interior_rms: the same less a
+        border of BORDER; uniformity: least over mean illuminance (intensity in the far field) on the coarse pixels within that
+        border, None of a shaded picture; uncoated_limit; lost: by cause, with of_source of sum 1; least_wall and greatest_radius,
+        mm; pixels; rays.
+    """
+    pixels, fewer = ((t.shape[0], t.shape[1]) for t in (target, coarse))
+    found = lamp_image(lamp, goal, field, values, pixels, fewer, rays, seed)
+    uniformity = None if shaded else _least_over_mean(found.coarse, coarse, _compared(coarse, goal, False, BORDER))
+    return found, {
+        "of_source": float(found.image.sum()),
+        "relative_rms": relative_rms(found.halves, target, _compared(target, goal, shaded, 0.0)),
+        "interior_rms": relative_rms(found.halves, target, _compared(target, goal, shaded, BORDER)),
+        "uniformity": uniformity,
+        "uncoated_limit": lamp.uncoated_limit,
+        "lost": found.lost,
+        "least_wall": least_wall(lamp, field, values),
+        "greatest_radius": field.extent(sides(values)[1])[1],
+        "pixels": list(pixels),
+        "rays": found.rays,
+    }
+
+
+def _compared(target: np.ndarray, goal: Goal, shaded: bool, border: float) -> np.ndarray:
+    """Pixels of the picture, see `lamp_figures`, less a border, a fraction of the smaller side of the target."""
+    density = target / goal.shares((target.shape[0], target.shape[1]))
+    lit = density > (0.0 if shaded else LIT * density.max())
+    reach = [round(border * min(goal.size) / s * n) for s, n in zip(goal.size, target.shape, strict=True)]
+    return minimum_filter(lit, [2 * r + 1 for r in reach], mode="constant", cval=False)
+
+
+def _least_over_mean(image: np.ndarray, target: np.ndarray, where: np.ndarray) -> float | None:
+    """Least over mean of image / target on some pixels; None where there is no light on them."""
+    if not where.any() or not image[where].any():
+        return None
+    seen = image[where] / target[where]
+    return float(seen.min() / seen.mean())

@@ -1,0 +1,438 @@
+"""Lamps: surfaces around a source, light of a chip through them, and their design."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import brentq
+
+from caustic_cli.effort import STANDARD
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.lamp import LampObjective, design_lamp, directions_of, field_of, pixels_of, wanted
+from caustic_cli.inverse.refractor_transport import envelope, source_directions
+from caustic_cli.optics.lamp import PointGrid, emissions, land, least_wall, through, through_point
+from caustic_cli.optics.surfaces.polarfield import PolarField, direction_of, frame, stereographic
+from caustic_cli.scene.lamp import Chip, Goal, Lamp
+from caustic_cli.studies.lamp import lamp_figures
+
+FIELD = PolarField.uniform((12, 9), (3, 4))
+FAR = Goal((100.0, 60.0))
+QUICK = replace(STANDARD, lamp_stages=((400, 10_000, 25, 0.1), (1000, 20_000, 25, 0.02)), lamp_control=32, lamp_cells=20)
+
+
+def bumpy(field=FIELD, radius=12.0, height=0.05, seed=0):
+    """A sphere with bumps: control values of log r."""
+    noise = torch.randn(field.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return field.sphere(radius) + height * noise
+
+
+def random(*shape, seed=1):
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def emit(chip, count, seed):
+    """The rays of a chip, fewer than are emitted at a time."""
+    (rays,) = emissions(chip, count, seed)
+    return rays
+
+
+# Geometry
+
+
+def test_the_frame_is_orthonormal_right_handed_and_along_the_coordinates():
+    u, v = (2.0 * random(2, 50) - 1.0).requires_grad_()
+    axes = torch.stack([torch.stack(a, 1) for a in frame(u, v)], 1)  # (N, 3, 3)
+    torch.testing.assert_close(axes @ axes.mT, torch.eye(3, dtype=torch.float64).expand(50, 3, 3))
+    torch.testing.assert_close(torch.linalg.det(axes), torch.ones(50, dtype=torch.float64))
+    k = 2.0 / (1.0 + u * u + v * v)
+    for j, along in enumerate(axes[:, :2].unbind(1)):
+        by = torch.stack([torch.autograd.grad(c.sum(), (u, v)[j], retain_graph=True)[0] for c in direction_of(u, v)], 1)
+        torch.testing.assert_close(by, k[:, None] * along)
+    torch.testing.assert_close(torch.stack(stereographic(*(3.0 * c for c in direction_of(u, v)))), torch.stack([u, v]))
+
+
+def test_normals_are_perpendicular_to_the_derivatives_of_the_points():
+    values = bumpy()
+    u, v = 1.6 * random(2, 40) - 0.8
+    normal = torch.stack(FIELD.normals(values, u, v), 1)
+    torch.testing.assert_close(normal.norm(dim=1), torch.ones(40, dtype=torch.float64))
+    h = 1e-6
+    for du, dv in ((h, 0.0), (0.0, h)):
+        ahead, behind = (torch.stack(FIELD.points(values, u + s * du, v + s * dv), 1) for s in (1.0, -1.0))
+        assert float(((ahead - behind) / (2.0 * h) * normal).sum(1).abs().max()) < 1e-7
+    assert bool(((normal * torch.stack(FIELD.points(values, u, v), 1)).sum(1) > 0).all())
+
+
+def test_a_sphere_has_its_radius_everywhere_and_refuses_none():
+    u, v = 1.4 * random(2, 10) - 0.7
+    points = torch.stack(FIELD.points(FIELD.sphere(7.5), u, v))
+    torch.testing.assert_close(points.norm(dim=0), torch.full((10,), 7.5, dtype=torch.float64))
+    with pytest.raises(InputError, match="greater than 0 mm"):
+        FIELD.sphere(0.0)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.05, 0.15])
+def test_intersections_are_the_first_crossing_found_by_brute_force(height):
+    values, n = bumpy(height=height), 100
+    origin = [6.0 * (random(n, seed=s) - 0.5) for s in (2, 3)] + [torch.zeros(n, dtype=torch.float64)]
+    direction = emit(Chip(), n, 5).direction
+    n = len(direction[0])
+    origin = tuple(o[:n] if len(o) >= n else o.repeat(2)[:n] for o in origin)
+    hit = FIELD.intersect(values, origin, direction)
+    t = torch.linspace(0.0, 24.0, 2401, dtype=torch.float64)[:, None]
+    x, y, z = (o + t * d for o, d in zip(origin, direction, strict=True))
+    u, v = stereographic(x, y, torch.where(t == 0, torch.ones_like(z), z))
+    outside = 0.5 * (x * x + y * y + z * z).log() > FIELD.at(values, u.reshape(-1), v.reshape(-1), [(0, 0)])[0].view(u.shape)
+    first, crossings = outside.double().argmax(0), (outside.diff(dim=0)).sum(0)
+    found = torch.stack([p - o for p, o in zip(hit.point, origin, strict=True)]).norm(dim=0)
+    once = crossings == 1
+    assert int(once.sum()) > 0.9 * n
+    assert bool(hit.valid[once].all())
+    assert float((found - t[first, 0])[once].abs().max()) < 1.05e-2  # the spacing of the samples
+    r = torch.stack(hit.point).norm(dim=0)
+    torch.testing.assert_close(r.log()[hit.valid], FIELD.at(values, hit.u, hit.v, [(0, 0)])[0][hit.valid], rtol=0, atol=1e-12)
+
+
+def test_rays_that_start_outside_have_no_intersection():
+    one = torch.ones(1, dtype=torch.float64)
+    hit = FIELD.intersect(FIELD.sphere(5.0), (6.0 * one, 0.0 * one, 1.0 * one), (0.0 * one, 0.0 * one, one))
+    assert not bool(hit.valid.any())
+    lamp = Lamp(Chip("disc", (2.0, 2.0)), inner=6.0, radius=15.0)
+    rays = emit(lamp.chip, 1000, 1)
+    light = through(lamp, FIELD, rays, FIELD.sphere(5.0))  # within the hemisphere: every ray misses, and is booked as such
+    assert float(light.power.sum()) == 0.0
+    assert float(light.lost["missed"].sum() + light.lost["inner_fresnel"].sum()) == pytest.approx(1.0, abs=1e-12)
+
+
+# Light
+
+
+@pytest.mark.parametrize("chip", [Chip(), Chip("disc", (3.0, 3.0)), Chip("rectangle", (2.0, 1.0))])
+def test_a_lambertian_chip_emits_by_the_cosine_from_its_whole_area(chip):
+    rays = emit(chip, 40_000, 3)
+    x, y, _ = rays.origin
+    dx, _, dz = rays.direction
+    assert float(rays.power.sum()) == pytest.approx(1.0, abs=1e-12)
+    assert float(dz.mean()) == pytest.approx(2.0 / 3.0, abs=2e-3)  # of cos(theta) / pi
+    assert float((dx * dx).mean()) == pytest.approx(0.25, abs=2e-3)
+    squares = {"point": (0.0, 0.0), "disc": (9.0 / 16.0, 9.0 / 16.0), "rectangle": (4.0 / 12.0, 1.0 / 12.0)}[chip.shape]
+    for c, square in zip((x, y), squares, strict=True):
+        assert float((c * c).mean()) == pytest.approx(square, abs=2e-3)
+    assert float((x * dx).mean()) == pytest.approx(0.0, abs=5e-3)
+
+
+@pytest.mark.parametrize("chip", [Chip(), Chip("disc", (4.0, 4.0))])
+def test_many_rays_are_emitted_some_at_a_time(chip):
+    parts = list(emissions(chip, 300_000, 1))
+    assert len(parts) == 3 and max(len(part.power) for part in parts) == 1 << 17
+    assert sum(float(part.power.sum()) for part in parts) == pytest.approx(1.0, abs=1e-12)
+    assert sum(float((part.power * part.direction[2]).sum()) for part in parts) == pytest.approx(2.0 / 3.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("chip", [Chip(), Chip("disc", (4.0, 4.0)), Chip("rectangle", (5.0, 3.0))])
+def test_all_light_is_booked(chip):
+    lamp, values = Lamp(chip, inner=5.0, radius=16.0), bumpy(height=0.2)
+    rays = emit(chip, 20_000, 3)
+    light = through(lamp, FIELD, rays, values)
+    total = light.power + sum(light.lost.values())
+    assert float((total - rays.power).abs().max()) < 1e-18
+    assert float(total.sum()) == pytest.approx(1.0, abs=1e-12)
+    assert min(float(light.lost[cause].sum()) for cause in ("inner_fresnel", "outer_fresnel", "total_internal_reflection")) > 0
+    norm = torch.stack(light.direction).norm(dim=0)[light.power > 0]
+    assert float((norm - 1.0).abs().max()) < 1e-12
+
+
+def test_a_sphere_about_a_point_loses_what_normal_incidence_reflects():
+    lamp, rays = Lamp(), emit(Chip(), 1000, 0)
+    light = through(lamp, FIELD, rays, FIELD.sphere(15.0))
+    assert float(light.power.sum()) == pytest.approx(lamp.uncoated_limit, abs=1e-12)
+    assert lamp.uncoated_limit == pytest.approx(0.9240, abs=1e-4)
+    torch.testing.assert_close(torch.stack(light.direction), torch.stack(rays.direction))
+
+
+def test_a_point_is_a_small_chip_and_its_grid_carries_the_same_light():
+    values = bumpy(height=0.02)
+    rays = emit(Chip(), 100_000, 1)
+    small = Chip("disc", (1e-9, 1e-9))
+    one, other = through(Lamp(), FIELD, rays, values), through(Lamp(small), FIELD, rays, values)
+    for a, b in zip((*one.direction, one.power), (*other.direction, other.power), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-7, atol=1e-9)
+    grids = PointGrid.of(FIELD, 100_000)
+    assert sum(float(grid.power.sum()) for grid in grids) == pytest.approx(1.0, abs=1e-12)
+    lights = [through_point(Lamp(), FIELD, grid, values) for grid in grids]
+    assert sum(float(light.power.sum()) for light in lights) == pytest.approx(float(one.power.sum()), abs=1e-5)
+    for k in (0, 1, 2):
+        mean = sum(float((light.power * light.direction[k]).sum()) for light in lights)
+        assert mean == pytest.approx(float((one.power * one.direction[k]).sum()), abs=2e-4)
+
+
+def test_rays_are_those_of_a_textbook_tracer():
+    """Roots by SciPy, normals by differences of points, Snell and Fresnel by angles."""
+    lamp, values = Lamp(Chip("rectangle", (4.0, 3.0)), inner=4.5, radius=16.0), bumpy(height=0.25)
+    rays = emit(lamp.chip, 100, 6)
+    light = through(lamp, FIELD, rays, values)
+
+    def height(points):
+        """|P| - r(P) of points (.., 3)."""
+        x, y, z = torch.from_numpy(np.atleast_2d(points)).T
+        u, v = stereographic(x, y, z)
+        return np.linalg.norm(points, axis=-1) - np.squeeze(FIELD.at(values, u, v, [(0, 0)])[0].exp().numpy())
+
+    def normal(point, h=1e-6):
+        """The gradient of |P| - r(P), by differences."""
+        found = np.array([height(point + h * e) - height(point - h * e) for e in np.eye(3)])
+        return found / np.linalg.norm(found)
+
+    def interface(d, n, eta):
+        """Direction and transmittance beyond a surface; None in total reflection."""
+        inside = math.acos(min(1.0, float(d @ n)))
+        if eta * math.sin(inside) >= 1.0:
+            return None
+        beyond = math.asin(eta * math.sin(inside))
+        out = eta * d + (math.cos(beyond) - eta * math.cos(inside)) * n
+        if inside < 1e-9:
+            return out, 1.0 - ((1.0 - eta) / (1.0 + eta)) ** 2
+        s = math.sin(inside - beyond) / math.sin(inside + beyond)
+        p = math.tan(inside - beyond) / math.tan(inside + beyond)
+        return out, 1.0 - 0.5 * (s * s + p * p)
+
+    checked = reflected = 0
+    for k in range(len(rays.power)):
+        o, d = (np.array([float(c[k]) for c in w]) for w in (rays.origin, rays.direction))
+        t = brentq(lambda t: np.linalg.norm(o + t * d) - lamp.inner, 0.0, 20.0, xtol=1e-14)  # noqa: B023
+        o = o + t * d
+        d, power = interface(d, o / lamp.inner, 1.0 / lamp.index)
+        if d[2] <= 0 or (np.diff(height(o + np.linspace(0.0, 25.0, 500)[:, None] * d) > 0) != 0).sum() != 1:
+            continue  # more than one crossing
+        t = brentq(lambda t: float(height(o + t * d)), 0.0, 25.0, xtol=1e-13)  # noqa: B023
+        point = o + t * d
+        np.testing.assert_allclose([float(c[k]) for c in light.point], point, atol=1e-9)
+        found = interface(d, normal(point), lamp.index)
+        if found is None:
+            assert float(light.power[k]) == 0.0 and float(light.lost["total_internal_reflection"][k]) > 0.0
+            reflected += 1
+            continue
+        np.testing.assert_allclose([float(c[k]) for c in light.direction], found[0], atol=1e-5)
+        assert float(light.power[k] / rays.power[k]) == pytest.approx(power * found[1], abs=1e-4)
+        checked += 1
+    assert checked > 50 and reflected > 2
+
+
+def test_an_ellipsoid_with_the_chip_at_its_focus_sends_all_light_into_one_direction():
+    """r = b / (1 - x.y / n), the stigmatic surface on which the transport rests."""
+    y = torch.tensor([0.1, -0.2, 0.9], dtype=torch.float64)
+    y = y / y.norm()
+    field, lamp = PolarField.uniform((80, 80), (5, 5)), Lamp()
+    u, v = (c.reshape(-1) for c in torch.meshgrid(*field.net.control_xy(), indexing="ij"))
+    g = torch.zeros(1, dtype=torch.float64)
+    log_r = envelope(direction_of(u, v), y[None], torch.ones(1, dtype=torch.float64), g, 0.01, lamp.index)
+    values = field.net.interpolated(log_r.view(field.shape)) + math.log(10.0)
+    (grid,) = PointGrid.of(field, 5000)
+    light = through_point(lamp, field, grid, values)
+    x = torch.stack(direction_of(grid.u, grid.v), 1)
+    seen = x @ y > 1.0 / lamp.index + 0.02  # beyond, the ellipsoid turns its back to y
+    assert 0.15 < float(seen.double().mean()) < 0.8
+    assert bool((light.power[seen] > 0).all())
+    assert float((torch.stack(light.direction, 1)[seen] @ y).min()) > 1.0 - 1e-8
+
+
+def test_coordinates_on_a_plane_and_in_the_far_field_are_those_of_directions():
+    pixels = (7, 5)
+    for goal in (FAR, Goal((4000.0, 3000.0), 2000.0)):
+        d = directions_of(goal, pixels)
+        light = through(Lamp(), FIELD, emit(Chip(), 4, 0), FIELD.sphere(10.0))
+        zero = torch.zeros(len(d), dtype=torch.float64)
+        x, y, ahead = land(goal, light._replace(point=(zero, zero, zero), direction=tuple(d.T), power=zero))
+        assert bool(ahead.all())
+        for c, n, s in zip((x.view(pixels)[:, 0], y.view(pixels)[0]), pixels, goal.size, strict=True):
+            torch.testing.assert_close(c, ((torch.arange(n, dtype=torch.float64) + 0.5) / n - 0.5) * s)
+
+
+def test_the_light_wanted_in_the_far_field_is_intensity_times_solid_angle():
+    power = wanted(Goal((90.0, 120.0)), np.ones((3, 3)), (6, 8))
+    edges = np.sin(np.radians(np.linspace(-60.0, 60.0, 9)))
+    np.testing.assert_allclose(power[0].numpy() / float(power[0].sum()), np.diff(edges) / (edges[-1] - edges[0]), rtol=1e-12)
+    assert pixels_of(Goal((30.0, 10.0), 8.0), 1200) == (60, 20)
+
+
+def test_the_light_of_the_transport_is_lambertian():
+    x, a = source_directions(80)
+    assert float(a.sum()) == pytest.approx(1.0, abs=1e-12)
+    assert float((a * x[:, 2]).sum()) == pytest.approx(2.0 / 3.0, abs=1e-3)
+
+
+# Two free-form surfaces
+
+
+@pytest.mark.parametrize("chip", [Chip(), Chip("disc", (3.0, 2.0))])
+def test_a_spherical_inner_surface_is_the_hemisphere(chip):
+    outer, rays = bumpy(height=0.2), emit(chip, 5000, 2)
+    one = through(Lamp(chip, inner=4.0), FIELD, rays, outer)
+    two = through(Lamp(chip, inner=4.0, surfaces=2), FIELD, rays, torch.stack([FIELD.sphere(4.0), outer]))
+    for a, b in zip((*one.point, *one.direction, one.power), (*two.point, *two.direction, two.power), strict=True):
+        lit = one.power > 0
+        torch.testing.assert_close(a[lit], b[lit], rtol=1e-9, atol=1e-9)
+    for cause, lost in one.lost.items():
+        torch.testing.assert_close(lost, two.lost[cause], rtol=1e-9, atol=1e-15)
+
+
+def test_all_light_is_booked_between_two_surfaces_and_the_grid_carries_the_same():
+    values = torch.stack([bumpy(radius=4.0, height=0.1, seed=3), bumpy(height=0.1)])
+    lamp = Lamp(inner=3.0, surfaces=2)
+    for chip in (Chip(), Chip("rectangle", (2.0, 2.0))):
+        rays = emit(chip, 30_000, 3)
+        light = through(replace(lamp, chip=chip), FIELD, rays, values)
+        assert float((light.power + sum(light.lost.values()) - rays.power).abs().max()) < 1e-18
+        assert float(light.lost["inner_fresnel"].sum()) > 0.0387
+    light = through(lamp, FIELD, emit(Chip(), 100_000, 3), values)
+    grids = [through_point(lamp, FIELD, grid, values) for grid in PointGrid.of(FIELD, 100_000)]
+    assert sum(float(one.power.sum()) for one in grids) == pytest.approx(float(light.power.sum()), abs=1e-4)
+
+
+def test_light_that_leaves_the_glass_on_its_way_is_booked_as_missed():
+    rays = emit(Chip(), 1000, 1)
+    light = through(Lamp(surfaces=2), FIELD, rays, torch.stack([FIELD.sphere(6.0), FIELD.sphere(5.0)]))  # crossed
+    assert float(light.power.sum()) == 0.0 and float(light.lost["missed"].sum()) > 0.9
+    dented = FIELD.sphere(4.0)
+    dented[5:7, :] += 0.9  # a wall across the inner surface, through which light of its flanks passes twice
+    with torch.no_grad():
+        light = through(Lamp(inner=3.0, surfaces=2), FIELD, emit(Chip(), 20_000, 1), torch.stack([dented, FIELD.sphere(15.0)]))
+    assert 0.0 < float(light.lost["missed"].sum()) < 0.9
+    assert float((light.power + sum(light.lost.values())).sum()) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_the_wall_between_two_surfaces_is_their_least_distance():
+    lamp, inner = Lamp(surfaces=2), FIELD.sphere(4.0)
+    assert least_wall(lamp, FIELD, torch.stack([inner, FIELD.sphere(10.0)])) == pytest.approx(6.0, abs=1e-6)
+    assert least_wall(lamp, FIELD, torch.stack([inner, FIELD.sphere(3.0)])) < 0.0
+    outer = bumpy(radius=7.0, height=0.1, seed=8)
+    wall = least_wall(lamp, FIELD, torch.stack([inner, outer]))
+    assert wall == pytest.approx(FIELD.extent(outer)[0] - 4.0, abs=2e-3)  # of a sphere it is along the radius
+    assert least_wall(Lamp(inner=4.0), FIELD, outer) == pytest.approx(wall, abs=2e-3)
+
+
+def test_two_surfaces_are_differentiable_to_second_order_remainders():
+    values = torch.stack([bumpy(radius=4.0, height=0.02, seed=3), bumpy(height=0.02)])
+    by = torch.randn(values.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
+    for chip in (Chip(), Chip("disc", (2.0, 2.0))):
+        lamp, rays = Lamp(chip, inner=3.0, surfaces=2), emit(chip, 400, 2)
+
+        def f(values, lamp=lamp, rays=rays):
+            light = through(lamp, FIELD, rays, values)
+            x, y, _ = land(FAR, light)
+            return (light.power * (0.01 * x + torch.sin(0.1 * y))).sum() + 0.1 * (rays.power * light.spare).sum()
+
+        start = values.clone().requires_grad_()
+        (g,) = torch.autograd.grad(f(start), start)
+        steps = [4e-4 * 0.5**k for k in range(5)]
+        remainders = [abs(float(f(values + h * by) - f(values) - h * (g * by).sum())) for h in steps]
+        assert 1.8 < np.polyfit(np.log(steps), np.log(remainders), 1)[0] < 2.2
+
+
+def test_two_surfaces_pass_more_light_than_one_and_keep_their_limits():
+    goal, square = Goal((30_000.0, 10_000.0), 8000.0), np.ones((2, 2))
+    effort = replace(QUICK, two_stages=((400, 10_000, 40, 0.1),), lamp_stages=((400, 10_000, 40, 0.1),))
+    fine, coarse = (wanted(goal, square, pixels_of(goal, count)).numpy() for count in (1500, 400))
+    found = {}
+    for surfaces, inner in ((1, 4.0), (2, 2.0)):
+        lamp = Lamp(index=1.49, inner=inner, surfaces=surfaces)
+        values = design_lamp(lamp, goal, square, effort=effort)
+        _, found[surfaces] = lamp_figures(lamp, goal, field_of(effort), values, fine, coarse, rays=100_000)
+        assert found[surfaces]["least_wall"] >= lamp.wall
+    assert found[2]["of_source"] > found[1]["of_source"] + 0.02
+    assert found[2]["greatest_radius"] < 15.5
+    assert FIELD.extent(values[0])[0] > 0.0 and field_of(effort).extent(values[0])[0] > 0.9 * 2.0
+
+
+# Gradients
+
+
+@pytest.mark.parametrize("chip", [Chip(), Chip("rectangle", (3.0, 2.0))])
+def test_the_light_is_differentiable_to_second_order_remainders(chip):
+    lamp, values = Lamp(chip, inner=5.0, radius=16.0), bumpy(height=0.02)
+    rays, by = emit(chip, 400, 2), torch.randn(FIELD.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
+
+    def f(values):
+        light = through(lamp, FIELD, rays, values)
+        x, y, _ = land(FAR, light)
+        return (light.power * (0.01 * x + torch.sin(0.1 * y))).sum() + 0.1 * (rays.power * light.spare).sum()
+
+    start = values.clone().requires_grad_()
+    (g,) = torch.autograd.grad(f(start), start)
+    steps = [1e-3 * 0.5**k for k in range(5)]
+    remainders = [abs(float(f(values + h * by) - f(values) - h * (g * by).sum())) for h in steps]
+    order = np.polyfit(np.log(steps), np.log(remainders), 1)[0]
+    assert 1.8 < order < 2.2
+
+
+@pytest.mark.parametrize("chip", [Chip(), Chip("disc", (2.0, 2.0))])
+def test_the_loss_is_differentiable_to_second_order_remainders(chip):
+    lamp, field = Lamp(chip), PolarField.uniform((10, 10))
+    goal = Goal((120.0, 120.0))
+    objective = LampObjective(lamp, goal, field, wanted(goal, np.ones((2, 2)), (8, 8)), 3000)
+    values, by = field.sphere(15.0), bumpy(field, seed=4) - field.sphere(12.0)
+    start = values.clone().requires_grad_()
+    (g,) = torch.autograd.grad(objective(start), start)
+    steps = [2e-3 * 0.5**k for k in range(5)]
+    remainders = [abs(float((objective(values + h * by) - objective(values)).detach()) - h * float((g * by).sum())) for h in steps]
+    assert 1.7 < np.polyfit(np.log(steps), np.log(remainders), 1)[0] < 2.3
+
+
+# Design
+
+
+@pytest.mark.parametrize("goal", [Goal((2000.0, 2000.0), 1000.0), Goal((100.0, 60.0))])
+def test_a_small_design_lights_its_target(goal):
+    losses = []
+    values = design_lamp(Lamp(), goal, np.ones((2, 2)), effort=QUICK, on_iteration=lambda *step: losses.append(step))
+    assert losses[-1][2] < losses[0][2]
+    assert {stage for stage, _, _ in losses} == {0, 1}
+    fine, coarse = (wanted(goal, np.ones((2, 2)), pixels_of(goal, count)).numpy() for count in (2000, 400))
+    found, figures = lamp_figures(Lamp(), goal, field_of(QUICK), values, fine, coarse, rays=200_000, seed=5)
+    assert figures["of_source"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-12)
+    assert figures["of_source"] > 0.82
+    assert figures["interior_rms"] < 0.12
+    assert figures["uniformity"] > 0.6
+    assert found.image.sum() == pytest.approx(figures["of_source"], abs=1e-12)
+
+
+def test_a_design_is_repeated_to_the_bit():
+    stages = ((100, 2000, 3, 0.1),)
+    effort = replace(STANDARD, lamp_stages=stages, chip_stages=stages, lamp_control=10, lamp_cells=12)
+    chip, goal = Lamp(Chip("disc", (0.5, 0.5))), Goal((80.0, 80.0))
+    one, other = (design_lamp(chip, goal, np.ones((2, 2)), effort=effort) for _ in range(2))
+    assert torch.equal(one, other)
+
+
+def test_a_surface_too_near_to_the_hemisphere_is_refused_with_the_radius_needed():
+    goal, effort = Goal((100.0, 100.0)), replace(STANDARD, lamp_stages=(), lamp_control=10, lamp_cells=16)
+    with pytest.raises(InputError, match=r"radius of [\d.]+ mm or more") as error:
+        design_lamp(Lamp(inner=5.0, radius=6.5), goal, np.ones((2, 2)), effort=effort)
+    radius = float(str(error.value).split("radius of ")[1].split()[0])
+    design_lamp(Lamp(inner=5.0, radius=radius), goal, np.ones((2, 2)), effort=effort)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Chip("square"), "one of point, disc, rectangle"),
+        (lambda: Chip("point", (1.0, 1.0)), "a point has no size"),
+        (lambda: Chip("disc", (1.0, 0.0)), "two sizes above 0 mm"),
+        (lambda: Chip("disc", (math.nan, 1.0)), "finite and not negative"),
+        (lambda: Lamp(index=1.0), "greater than 1"),
+        (lambda: Lamp(Chip("rectangle", (8.0, 8.0)), inner=5.0), "greater than the radius of the chip, 5.65685 mm"),
+        (lambda: Lamp(radius=4.5), "5 mm"),
+        (lambda: Lamp(wall=0.0), "wall"),
+        (lambda: Goal((0.0, 1.0), 5.0), "greater than 0"),
+        (lambda: Goal((1.0, 1.0), 0.0), "distance"),
+        (lambda: Goal((180.0, 20.0)), "at most 178 degrees"),
+        (lambda: wanted(Goal((10.0, 10.0)), np.zeros((3, 3)), (4, 4)), "black"),
+    ],
+)
+def test_values_out_of_range_are_refused_in_one_line(make, words):
+    with pytest.raises(InputError) as error:
+        make()
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
