@@ -49,6 +49,7 @@ SLOW = (
     "test_intersection.py",
     "test_irradiance.py",
     "test_kernel_cache.py",
+    "test_lamp_cli.py",
     "test_light.py",
     "test_manufacture.py",
     "test_measured.py",

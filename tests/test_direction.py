@@ -470,9 +470,21 @@ def test_design_and_render(in_tmp, capfd, mirror):
     assert seen["relative_rms"] == pytest.approx(made["relative_rms"], abs=0.05)
 
 
+def test_a_lens_with_a_gradient(in_tmp, capfd):
+    """Its start is that of a homogeneous lens, and its rays are traced through the gradient."""
+    write_blob()
+    few = ("--rays", "10000", "--iterations", "4")
+    assert (
+        design("--source-tilt", "20,0", "--gradient", "axial", "--gradient-terms", "0.01", *few, "--json", "--thickness", "2") == 0
+    )
+    made = json.loads(capfd.readouterr().out)
+    assert made["error"] < 0.4 and made["on_screen"] > 0.7
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        (("--source-tilt", "20,0", "--gradient", "free"), "without --gradient"),
         (("--source-tilt", "85,0"), "-80 to 80"),
         (("--source-tilt", "70,60"), "within 80 degrees"),
         (("--source-tilt", "20,0", "--robust", "t.toml"), "--robust"),

@@ -63,7 +63,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
     },
     "source.tilt": {
         **dict.fromkeys(
-            (*TRAITS["two sides"].settings, "lens.gradient", "element", "design.over"),
+            (*TRAITS["two sides"].settings, "lens.gradient free", "element", "design.over"),
             "⟨source.tilt⟩ is for a lens with a flat entrance, an array of lenslets or a mirror, without ⟨{path}⟩",
         ),
         "design.robust": "⟨source.tilt⟩ cannot be combined with ⟨design.robust⟩, whose errors are those of light along the axis",
