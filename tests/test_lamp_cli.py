@@ -238,6 +238,12 @@ def test_what_a_lamp_has_not_is_refused_in_one_line(command, words, road, capfd)
     assert words in refused(capfd, name, str(road), *options)
 
 
+def test_of_several_formats_none_is_written_where_one_is_refused(road, capfd):
+    before = set(Path().iterdir())
+    assert "a lamp's surface is none" in refused(capfd, "export", str(road), "--format", "ldt,step")
+    assert set(Path().iterdir()) == before
+
+
 def test_a_lens_has_no_photometric_file(capfd):
     small = ["--resolution", "32", "--control", "20", "--rays", "4000", "--iterations", "1", "--waves", "off", "--quiet"]
     assert cli.run(["design", "disc", *small]) == 0  # a picture by its name, of a lens as well

@@ -165,6 +165,8 @@ def _export_lamp(asked: ExportOptions, path: Path) -> None:
         formats = [name.strip() for name in asked.format.split(",")]
     if asked.output and len(formats) > 1:
         raise InputError("--out names one file; several formats are written beside each other under the project's own name")
+    for name in formats:
+        lamp.check_export(name, samples)
     project, found = Project.open(path), []
     for name in formats:
         found.append(lamp.export(project, name, asked.output, samples, asked.force, asked.say))

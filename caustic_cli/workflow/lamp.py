@@ -218,6 +218,20 @@ def render(
     return figures
 
 
+def check_export(format: str, samples: tuple[int, int] | None) -> None:
+    """Refuse a format that no lamp has, or samples of one that has none.
+
+    Raises:
+        InputError: as it says.
+    """
+    if format not in FORMATS:
+        raise InputError(
+            f"⟨format⟩ {format} holds height fields, and a lamp's surface is none; {', '.join(FORMATS)} hold the lamp or its light"
+        )
+    if samples is not None and format in PHOTOMETRIC:
+        raise InputError(f"⟨samples⟩ belongs to {', '.join(MESHES)}, got {format}")
+
+
 def export(
     project: Project, format: str, output: Path | None, samples: tuple[int, int] | None, force: bool, say: Reporter
 ) -> dict[str, Any]:
@@ -228,12 +242,7 @@ def export(
         InputError: there is no lamp, the format is not one of a lamp, or a file exists already; nothing was written.
     """
     began = time.monotonic()
-    if format not in FORMATS:
-        raise InputError(
-            f"⟨format⟩ {format} holds height fields, and a lamp's surface is none; {', '.join(FORMATS)} hold the lamp or its light"
-        )
-    if samples is not None and format in PHOTOMETRIC:
-        raise InputError(f"⟨samples⟩ belongs to {', '.join(MESHES)}, got {format}")
+    check_export(format, samples)
     assert project.path is not None
     path = output or Path(project.path.resolve().stem + FORMATS[format][0])
     made = uptodate.Outputs(project, "export", {"format": format, "samples": samples}, [path])
