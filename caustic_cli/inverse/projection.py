@@ -74,6 +74,7 @@ class ScreenProjection:
         return px, py, pz
 
     sign, axial_scale = 1.0, (1.0, 1.0)  # as of `relay.RelayedScreen`, without elements between lens and screen
+    aligned = False  # whether the pixels are a regular lattice on the plane
 
     def gain(self, index: float) -> float:
         """Change of (u, v) per slope of a surface, mm, to first order; index: as of `surface_from_map.surface`."""
@@ -154,7 +155,7 @@ class BeamProjection(ScreenProjection):
         return middle[:2], (along - np.outer(ahead, ahead @ along))[:2]
 
     @property
-    def aligned(self) -> bool:
+    def aligned(self) -> bool:  # type: ignore[override]  # as above
         """Whether the pixels of a plane screen are a regular lattice along u and v in the linear approximation."""
         return not self.screen.curved and abs(self._linear[1][[0, 1], [1, 0]]).max() <= SQUARE
 

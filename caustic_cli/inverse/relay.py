@@ -60,6 +60,7 @@ class RelayedScreen:
 
     scene: Scene
     centre_z: float
+    aligned = True  # as of a `ScreenProjection`
 
     @cached_property
     def system(self) -> System:

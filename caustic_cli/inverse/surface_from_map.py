@@ -121,7 +121,7 @@ def surface(
     _check_place(index, z_screen, thickness)
     d = _directions(directions, (shape[0] + 1, shape[1] + 1))
     half = tuple(float(h) for h in source_half)
-    first = {} if projection is None else {**ROUGHLY, "levels": LEVELS[:-1]}
+    first = {} if projection is None or projection.aligned else {**ROUGHLY, "levels": LEVELS[:-1]}
     map_ = solve(source, target, half, target_half, **{**options, **first})
     options.pop("start", None)
     x, y = corners(shape[0], half[0])[:, None], corners(shape[1], half[1])[None, :]

@@ -48,6 +48,9 @@ SEEN, MANY = 8, 4096  # FINE at least; beyond that, at most so many points along
 #: Transport error at which sites whose cells the raster misses are merged with neighbours, for convergence; most repetitions.
 MERGED, ROUNDS = 5e-3, 4
 SCATTERED, NEARBY = 2e-3, 16  # MERGED of scattered sites, many of them at the edge of the light, and with how many neighbours
+#: Of scattered sites: tolerance in that of others, since what is left is the light of a few sites at the edge, and steps after
+#: which those whose cells are still empty are merged.
+STRICTER, STEPS = 0.25, 2
 COVERED = 0.99  # part of the scattered sites that move by no more than the map is widened for its first prices
 LEAST = 128  # raster points along an axis
 LEVELS = (64, 16, 4, 1)  # ratios of the number of sites on the finest level to that on each level
@@ -252,8 +255,9 @@ def solve_displaced(
     spread = [np.quantile(np.abs(d), COVERED) / h for d, h in zip((moved.y1 - sites.y1, moved.y2 - sites.y2), (a, b), strict=True)]
     phi = phi + 0.5 * (spread[0] * raster[0][:, None] ** 2 + spread[1] * raster[1] ** 2)  # whose map reaches the outermost sites
     psi, light = moved.prices(phi, raster)[0], _light(f, 0.0, raster, a, b)
+    tolerance *= STRICTER
     psi, error, taken = _newton(psi, moved, raster, light, max(tolerance, SCATTERED), most)
-    psi, moved, error, more = _without_empty(psi, moved, error, taken, raster, light, tolerance, most, NEARBY)
+    psi, moved, error, more = _without_empty(psi, moved, error, taken, raster, light, tolerance, STEPS, NEARBY)
     return _map(psi, moved, shape, (a, b), smooth, error, taken + more, began)
 
 
