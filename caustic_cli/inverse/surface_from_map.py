@@ -43,6 +43,7 @@ from caustic_cli.optics.frames import IDENTITY
 Projection = ScreenProjection | RelayedScreen  # of a screen that is not the plane z_screen
 #: Cells over which e is smoothed, each with its share where there is light: wide averages count where there is none nearby.
 SMOOTHING = {2.0: 1.0, 8.0: 1e-3, 32.0: 1e-6}
+DISTINCT = 1e-9  # least usual stretch over the greatest, where most light goes to one point
 KINK = 3.0  # stretch of the map, in its median, from which e is not that of T: at a kink of phi the spline smooths the slopes
 NEGLIGIBLE = 0.05  # RMS of e, pixels, that is not corrected
 #: Options of the first map onto projected pixels, which is then solved again onto these where they lie.
@@ -185,7 +186,8 @@ def _smoothed(off: np.ndarray, map_: Transport) -> np.ndarray:
     """Displacements (2, n + 1, m + 1), mm, smoothed over cells, without those where the map stretches the light far more than on
     average: there the spline smooths a kink, and theirs are those around."""
     stretch = sum(np.gradient(c, axis=axis) ** 2 for c in (map_.x, map_.y) for axis in (0, 1))
-    weight = 1.0 / (1.0 + (stretch / (KINK**2 * np.median(stretch))) ** 2)
+    usual = max(float(np.median(stretch)), DISTINCT * float(stretch.max())) or 1.0
+    weight = 1.0 / (1.0 + (stretch / (KINK**2 * usual)) ** 2)
     total, part = np.zeros_like(off), np.zeros_like(weight)
     for width, share in SMOOTHING.items():
         part += share * gaussian_filter(weight, width)
