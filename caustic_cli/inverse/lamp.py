@@ -39,7 +39,7 @@ APRON, FILTER = 4, Filter("cosine", (3, 3))
 #: Degree of the spline.
 DEGREE = 3
 #: Points of a grid at which limits of two surfaces hold, weight of their squares, and the wall there over that to be kept.
-ROOM_POINTS, STIFF, SAFE = 8000, 3.0, 1.3
+LIMIT_POINTS, STIFF, SAFE = 8000, 3.0, 1.3
 #: Radius of the first inner surface, a sphere, over its least one.
 BEGIN = 4.0 / 3.0
 
@@ -94,7 +94,7 @@ class LampObjective:
         self.target = smooth / smooth.sum()
         self.lit = float((target > 0).sum())
         self.splat = backend_for("cpu").splat
-        self.room = Room(lamp, field) if lamp.surfaces == 2 else None
+        self.limits = SurfaceLimits(lamp, field) if lamp.surfaces == 2 else None
 
     def terms(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """rho^2, efficiency (light on target and apron), mean distance beside the target, and lack of margin."""
@@ -116,15 +116,15 @@ class LampObjective:
     def __call__(self, values: Tensor) -> Tensor:
         square, efficiency, distance, lack = self.terms(values)
         loss = square + self.weight * (1.0 - efficiency + distance + lack)
-        return loss if self.room is None else loss + self.room.lack(values)
+        return loss if self.limits is None else loss + self.limits.lack(values)
 
 
-class Room:
+class SurfaceLimits:
     """Limits of two free-form surfaces, at the points of a grid: a wall between them, estimated by the radial distance and the
     slopes, the least radius of the inner one, and the greatest of the outer one."""
 
     def __init__(self, lamp: Lamp, field: PolarField):
-        self.lamp, self.grids = lamp, PointGrid.of(field, ROOM_POINTS)
+        self.lamp, self.grids = lamp, PointGrid.of(field, LIMIT_POINTS)
 
     def lack(self, values: Tensor) -> Tensor:
         """Sum of squares of what lacks, relative to each limit, per point, times STIFF."""
