@@ -22,6 +22,7 @@ import math
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.lamp import lambertian
 from caustic_cli.optics.surfaces.polarfield import PolarField, Vectors, direction_of
 
 #: Cells of the source along u and v.
@@ -37,10 +38,9 @@ def source_directions(cells: int = CELLS) -> tuple[Tensor, Tensor]:
     """Directions (N, 3) of a Lambertian point on a grid of stereographic coordinates, and its light there (N,), of sum 1."""
     u = (2.0 * torch.arange(cells, dtype=torch.float64) + 1.0) / cells - 1.0
     u, v = (c.reshape(-1) for c in torch.meshgrid(u, u, indexing="ij"))
-    rho2 = u * u + v * v
-    lit = rho2 < 1.0
-    u, v, rho2 = u[lit], v[lit], rho2[lit]
-    weight = (1.0 - rho2) / (1.0 + rho2) ** 3
+    lit = u * u + v * v < 1.0
+    u, v = u[lit], v[lit]
+    weight = lambertian(u, v)
     return torch.stack(direction_of(u, v), 1), weight / weight.sum()
 
 

@@ -110,6 +110,7 @@ def surface(
         corrections: most outer iterations.
         centre: of the picture on the plane, mm.
         projection: of a screen that does not lie in that plane; target, centre and landing points are then projected.
+        pixels: of the picture, where they lie in these coordinates; None where they are those of target.
         options: of `transport.solve`.
 
     Raises:

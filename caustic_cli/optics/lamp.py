@@ -99,6 +99,12 @@ def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
         yield ChipRays((x, y, torch.zeros_like(x)), (dx, dy, dz), torch.full_like(dx, 1.0 / total))
 
 
+def lambertian(u: Tensor, v: Tensor) -> Tensor:
+    """Light of a Lambertian emitter per area of (u, v), up to a factor, see the module; for u^2 + v^2 <= 1."""
+    rho2 = u * u + v * v
+    return (1.0 - rho2) / (1.0 + rho2) ** 3
+
+
 class PointGrid:
     """Rows of a tensor grid of directions (u, v) of the light of a point, without the corners that it does not reach.
 
@@ -109,8 +115,7 @@ class PointGrid:
         u, v = torch.meshgrid(2.0 * sample.u - 1.0, 2.0 * sample.v - 1.0, indexing="ij")
         self.lit = (u * u + v * v < 1.0).reshape(-1).nonzero()[:, 0]
         self.u, self.v = u.reshape(-1)[self.lit], v.reshape(-1)[self.lit]
-        rho2 = self.u * self.u + self.v * self.v
-        self.power = (1.0 - rho2) / (1.0 + rho2) ** 3
+        self.power = lambertian(self.u, self.v)
         self._surface = field.net.prepare(sample, torch.float64)
 
     @classmethod
@@ -162,7 +167,7 @@ def _along(like: Tensor) -> Vectors:
 
 def _from_point(lamp: Lamp, hit: PolarHit, power: Tensor) -> LampLight:
     """Light of the origin, which meets the hemisphere at normal incidence and the surface along the frame's axis."""
-    kept = 1.0 - ((lamp.index - 1.0) / (lamp.index + 1.0)) ** 2
+    kept = math.sqrt(lamp.uncoated_limit)  # of one surface
     return _leave(
         lamp, hit, _along(power), kept * power, {"inner_fresnel": (1.0 - kept) * power, "missed": torch.zeros_like(power)}
     )

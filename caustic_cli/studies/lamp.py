@@ -16,6 +16,7 @@ import torch
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
+from caustic_cli.effort import STANDARD
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.lamp import LOSSES, LampLight, emissions, land, least_wall, sides, through
 from caustic_cli.optics.reconstruction import Filter
@@ -25,7 +26,7 @@ from caustic_cli.scene import Screen
 from caustic_cli.scene.lamp import Goal, Lamp
 
 #: Rays of an evaluation.
-RAYS = 4_000_000
+RAYS = STANDARD.final_rays
 #: Part of the smaller side of the target that is left out along its edges for the error of the interior.
 BORDER = 0.025
 #: A pixel of a picture without shades counts as lit entirely if it has more than this part of the greatest density.
@@ -82,14 +83,20 @@ def lamp_image(
     return LampImage(0.5 * (one + other), fewer.numpy(), (one, other), lost, count)
 
 
-def relative_rms(halves: tuple[np.ndarray, np.ndarray], target: np.ndarray, where: np.ndarray) -> float | None:
-    """Root mean square of the relative deviation of an image from its target over some pixels, corrected for noise; None for none.
+def relative_rms(
+    halves: tuple[np.ndarray, np.ndarray], target: np.ndarray, where: np.ndarray
+) -> tuple[float, float] | tuple[None, None]:
+    """Root mean square of the relative deviation of an image from its target over some pixels, corrected for noise, and its
+    standard error, by the difference of the halves; None for no pixels.
 
     The standard deviation of the illuminance over its mean where the target is uniform."""
     if not where.any() or not all(half[where].sum() > 0 for half in halves):
-        return None
+        return None, None
     one, other = (half[where] / target[where] for half in halves)
-    return math.sqrt(max(0.0, float(((one / one.mean() - 1.0) * (other / other.mean() - 1.0)).mean())))
+    a, b = one / one.mean() - 1.0, other / other.mean() - 1.0
+    square, noise = max(0.0, float((a * b).mean())), 0.5 * float(np.mean((a - b) ** 2))  # noise: of a and of b, squared
+    error = math.sqrt((noise * noise + 2.0 * square * noise) / a.size)  # of the square, to first order in independent pixels
+    return math.sqrt(square), min(math.sqrt(error), 0.5 * error / math.sqrt(square)) if square > 0 else math.sqrt(error)
 
 
 def lamp_figures(
@@ -112,17 +119,21 @@ def lamp_figures(
 
     Returns:
         the image, and of_source: light on the target; relative_rms: over all pixels of the picture; interior_rms: the same less a
-        border of BORDER; uniformity: least over mean illuminance (intensity in the far field) on the coarse pixels within that
-        border, None of a shaded picture; uncoated_limit; lost: by cause, with of_source of sum 1; least_wall and greatest_radius,
-        mm; pixels; rays.
+        border of BORDER; noise and interior_noise: of either; uniformity: least over mean illuminance (intensity in the far field)
+        on the coarse pixels within that border, None of a shaded picture; uncoated_limit; lost: by cause, with of_source of sum 1;
+        least_wall and greatest_radius, mm; pixels; rays.
     """
     pixels, fewer = ((t.shape[0], t.shape[1]) for t in (target, coarse))
     found = lamp_image(lamp, goal, field, values, pixels, fewer, rays, seed)
+    whole = relative_rms(found.halves, target, _compared(target, goal, shaded, 0.0))
+    interior = relative_rms(found.halves, target, _compared(target, goal, shaded, BORDER))
     uniformity = None if shaded else _least_over_mean(found.coarse, coarse, _compared(coarse, goal, False, BORDER))
     return found, {
         "of_source": float(found.image.sum()),
-        "relative_rms": relative_rms(found.halves, target, _compared(target, goal, shaded, 0.0)),
-        "interior_rms": relative_rms(found.halves, target, _compared(target, goal, shaded, BORDER)),
+        "relative_rms": whole[0],
+        "noise": whole[1],
+        "interior_rms": interior[0],
+        "interior_noise": interior[1],
         "uniformity": uniformity,
         "uncoated_limit": lamp.uncoated_limit,
         "lost": found.lost,

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +37,7 @@ from caustic_cli.project.project import RENDER, Project
 from caustic_cli.scene.lamp import Goal, Lamp
 from caustic_cli.studies.lamp import lamp_figures
 from caustic_cli.studies.photometry import FLUX, intensity_table
+from caustic_cli.studies.tolerances import one_thread
 from caustic_cli.workflow.reporter import Reporter
 
 retrace = OnDemand("caustic_cli.studies.retrace")
@@ -146,7 +146,7 @@ def design(
             history.append((len(history) + 1, stage, loss, 0.0, began.seconds))
             show(f"stage {stage + 1}/{last}", f"loss {loss:.5f}", len(history), total)
 
-        with _one_thread():
+        with one_thread():  # the tensors of a chunk of rays are too small for more
             values = design_lamp(lamp, goal, picture, effort=effort, seed=s.design.seed, on_iteration=told)
     found = LampDesign(project, lamp, goal, field_of(effort), values, picture, {})
     image, figures = found.image_and_figures(None, s.design.seed)
@@ -161,17 +161,6 @@ def design(
             directory.create(project, force, Checkpoint(state, found.field.spaces, made, figures, uptodate.inputs(project)))
             _write_image(out / RENDER, image, project, goal)
     return replace(found, figures=figures)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Run with one thread of torch: the tensors of a chunk of rays are too small for more, which wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
@@ -275,7 +264,11 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
     width, height = figures["pixels"]
     found = [
         ("on target", f"{figures['of_source']:.2%} of all light; uncoated limit {figures['uncoated_limit']:.2%}"),
-        ("relative RMS error", f"{number('interior_rms', '.4f')}; with the outer 2.5 % {number('relative_rms', '.4f')}"),
+        (
+            "relative RMS error",
+            f"{number('interior_rms', '.4f')}, noise {number('interior_noise', '.2g')}; with the outer 2.5 %"
+            f" {number('relative_rms', '.4f')}, noise {number('noise', '.2g')}",
+        ),
         ("least over mean", number("uniformity", ".3f")),
         ("lost", ", ".join(f"{name} {part:.2%}" for name, part in lost.items()) or "nothing"),
     ]
