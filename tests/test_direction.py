@@ -20,6 +20,7 @@ from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.projection import BeamProjection
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.beam import Beam
+from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.interface import interact, slopes_inside
 from caustic_cli.optics.misalignment import Misalignment, landing_points
@@ -374,6 +375,21 @@ def test_a_screen_along_the_light_is_refused():
 def test_rotations_to_axes(angles):
     x, _, z = tilted(angles)
     assert tilt_to(x, z) == pytest.approx(angles, abs=1e-12)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_effects_of_a_screen_are_told_from_its_place_in_the_light(mirror):
+    """A screen square to tilted light and centred on it has no effects of its own; one in another place is moved there without."""
+    lit = scene((30.0, 20.0), mirror=mirror)
+    decided = [(effect, effect.decide(lit, None)) for effect in EFFECTS if effect.name in ("screen-tilt", "screen-shift")]
+    assert [decision.on for _, decision in decided] == [False, False]
+    (x, y), (a, b) = lit.screen.shift, lit.screen.tilt
+    moved = replace(lit, screen=replace(lit.screen, shift=(x + 3.0, y), tilt=(a, b + 10.0)))
+    for effect, _ in decided:
+        assert effect.decide(moved, None).on
+        moved = effect.without(moved)
+    np.testing.assert_allclose(moved.screen.shift, lit.screen.shift, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(moved.screen.tilt, lit.screen.tilt, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

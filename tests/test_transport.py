@@ -384,6 +384,20 @@ def test_the_envelope_of_scattered_sites(n):
     np.testing.assert_allclose(planes.reshape(-1, n)[at, np.arange(n)], back, rtol=0, atol=1e-14)
 
 
+def test_cells_between_the_points_of_the_raster():
+    """Of scattered sites no cell is too small for it: masses are those that a raster finds which is 60 times as fine."""
+    sites, psi = scattered()
+    a, b = sites.half
+    coarse = [transport.centres(20, h) for h in (a, b)]
+    light = transport._light(np.full((1, 1), 0.25 / (a * b)), 0.0, coarse, a, b)
+    masses = transport._cells(psi, sites, coarse, light)[1]
+    _, site = sites.envelope(psi).on(*(transport.centres(1200, h) for h in (a, b)))
+    counted = np.bincount(site.ravel(), minlength=len(psi)) / site.size
+    seen = np.bincount(sites.envelope(psi).on(*coarse)[1].ravel(), minlength=len(psi)) > 0
+    assert np.count_nonzero((counted > 0) & ~seen) > 10
+    np.testing.assert_allclose(masses, counted, rtol=0, atol=2e-5)
+
+
 def test_displaced_sites():
     """By a constant: the same map, displaced.  By a field: light lands where the displaced pixels are."""
     target = smooth((40, 30))

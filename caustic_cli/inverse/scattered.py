@@ -12,11 +12,11 @@ pixel, neighbouring pixels would receive two of these points or none; so sites k
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from caustic_cli.inverse.transport import point_masses
 from caustic_cli.loading import OnDemand
@@ -26,8 +26,7 @@ laguerre = OnDemand("caustic_cli.optics.kernels.laguerre")
 #: Distance of the four corners added around all sites, in their extent; part of the source's half sizes beyond which they may be on
 #: the envelope.
 AROUND, BEYOND = 1.0, 1.5
-#: Sites whose prices are found together.
-SOME = 4096
+EVERY = 4  # points of a raster, one of which is among those where its gradient is known
 OPTIONS = "Qt Q12"  # triangulated; with wide facets where sites are nearly coplanar
 
 
@@ -40,27 +39,26 @@ class Scattered:
     mass: np.ndarray
     half: tuple[float, float]
     home: np.ndarray
+    _last: list[LowerHull] = field(default_factory=list, init=False, repr=False)
 
     def envelope(self, psi: np.ndarray) -> LowerHull:
-        """phi of these sites at prices psi (N,), mm^2."""
-        return LowerHull(psi, self)
-
-    def without(self, seen: np.ndarray, mass: np.ndarray) -> Scattered:
-        """Those that are `seen` (N,) bool, with these masses."""
-        return Scattered(self.y1[seen], self.y2[seen], mass, self.half, self.home[:, seen])
+        """phi of these sites at prices psi (N,), mm^2; that of the last ones is kept."""
+        if not (self._last and np.array_equal(psi, self._last[0].psi)):
+            self._last[:] = [LowerHull(psi, self)]
+        return self._last[0]
 
     def displaced(self, by1: np.ndarray, by2: np.ndarray) -> Scattered:
         """The same displaced from their own places, by (N,) mm along each axis."""
         return replace(self, y1=self.home[0] + by1, y2=self.home[1] + by2)
 
     def prices(self, phi: np.ndarray, raster: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Prices (N,), mm^2, at which the planes of the sites touch phi on a raster, and where, as of `laguerre.prices`: every site
-        is a row of its own, SOME at a time."""
-        psi, at, phi = np.empty(len(self.y1)), np.empty(len(self.y1), np.int64), np.ascontiguousarray(phi)
-        order = np.argsort(self.y1, kind="stable")
-        for some in np.array_split(order, -(-len(order) // SOME)):
-            psi[some], at[some] = laguerre.prices(phi, self.y1[some], np.arange(len(some) + 1), self.y2[some], *raster)
-        return psi, at
+        """Prices (N,), mm^2, at which the planes of the sites touch phi on a raster, and where, as of `laguerre.prices`: climbing
+        from the nearest of every few points by the gradient of phi."""
+        few = [slice(None, None, max(1, min(EVERY, len(x) // 2))) for x in raster]
+        slopes = np.stack(np.gradient(phi[few[0], few[1]], *(x[every] for x, every in zip(raster, few, strict=True))))
+        nearest = cKDTree(slopes.reshape(2, -1).T).query(np.column_stack([self.y1, self.y2]))[1]
+        i, j = np.unravel_index(nearest, slopes.shape[1:])
+        return laguerre.climbed(phi, self.y1, self.y2, *raster, i * few[0].step * phi.shape[1] + j * few[1].step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +84,12 @@ class LowerHull:
         points = np.column_stack(self.planes)
         points = (points - points.mean(0)) / np.ptp(points, axis=0)
         hull = ConvexHull(points, qhull_options=OPTIONS)
-        below = hull.simplices[hull.equations[:, 2] < 0.0].astype(np.int64)
-        a, b = np.concatenate([below[:, [0, 1]], below[:, [1, 2]], below[:, [2, 0]]]).T
-        pairs = np.unique(np.concatenate([a * len(points) + b, b * len(points) + a]))
-        first = np.searchsorted(pairs, np.arange(len(points) + 1) * len(points))
-        return first, (pairs % len(points)).astype(np.int32)
+        below = hull.simplices[hull.equations[:, 2] < 0.0]
+        return laguerre.adjacency(below, len(points))
+
+    def borders(self, site: np.ndarray) -> tuple[np.ndarray, ...]:
+        """As of `laguerre.borders`, also of cells too narrow for a raster."""
+        return laguerre.linked(*self.neighbours, len(self.psi))
 
     def on(self, x1: np.ndarray, x2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As of `laguerre.envelope`."""

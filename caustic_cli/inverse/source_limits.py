@@ -143,7 +143,7 @@ def point_source(scene: Scene) -> Source:
 
 def points_of(spread: Spread) -> int:
     """Number of points of a source whose blurs represent it: one if the blur varies little over it, or has no parts."""
-    if spread.turned:
+    if spread.exchanged:
         return 1
     each = math.ceil((spread.usual / (EXACT * max(spread.reach()))) ** 2)
     return 1 if each <= 1 or not min(spread.half) > 0 else min(each, MOST_MODES)

@@ -46,8 +46,8 @@ SMOOTHING = {2.0: 1.0, 8.0: 1e-3, 32.0: 1e-6}
 DISTINCT = 1e-9  # least usual stretch over the greatest, where most light goes to one point
 KINK = 3.0  # stretch of the map, in its median, from which e is not that of T: at a kink of phi the spline smooths the slopes
 NEGLIGIBLE = 0.05  # RMS of e, pixels, that is not corrected
-#: Options of the first map onto projected pixels, which is then solved again onto these where they lie.
-ROUGHLY = {"tolerance": 1e-2, "most": 10}
+#: Options of the first map onto pixels in a projection, from which e is known: a quarter of the sites.
+ROUGHLY = {"tolerance": 1e-2, "most": 10, "levels": LEVELS[:-1]}
 REPEATS = 4  # most fixed-point iterations; each reduces the error by a factor of about angle^2 / throw
 CONVERGED = 1e-10  # largest expected change of a height in the next iteration, mm
 ROWS = 64  # of corners processed at a time, so that intermediate arrays fit in the cache
@@ -123,8 +123,8 @@ def surface(
     _check_place(index, z_screen, thickness)
     d = _directions(directions, (shape[0] + 1, shape[1] + 1))
     half = tuple(float(h) for h in source_half)
-    first = {} if projection is None or projection.aligned else {**ROUGHLY, "levels": LEVELS[:-1]}
-    map_ = solve(source, target, half, target_half, **{**options, **first})
+    rough = projection is not None and corrections > 0
+    map_ = solve(source, target, half, target_half, **{**options, **(ROUGHLY if rough else {})})
     options.pop("start", None)
     x, y = corners(shape[0], half[0])[:, None], corners(shape[1], half[1])[None, :]
     light = np.pad(np.asarray(source, dtype=np.float64), 1)
@@ -139,11 +139,15 @@ def surface(
         miss = float(np.sqrt((light * (off**2).sum(0)).sum()))
         off = _smoothed(off, map_)
         settled = not np.sqrt((light * (off**2).sum(0)).sum()) > NEGLIGIBLE * min(pixel)
-        if again == corrections or (settled and (again or not first)):
+        if not rough and (settled or again == corrections):
             break
-        shift += off
-        sites = map_.solved.sites if again else (pixels or Pixels(np.asarray(target), target_half)).sites(source, half)
-        map_ = solve_displaced(source, sites, half, map_.potential, shift, **options)
+        if settled and projection and projection.aligned:
+            map_ = solve(source, target, half, target_half, start=map_.potential, **options)
+        else:
+            known = map_.solved.sites if shift.any() else (pixels or Pixels(np.asarray(target), target_half)).sites(source, half)
+            shift += off
+            map_ = solve_displaced(source, known, half, map_.potential, shift, **options)
+        rough = False
         aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
     return MappedSurface(z, *landing, miss, shift, again, map_, time.perf_counter() - began)
 

@@ -47,10 +47,7 @@ FINE = 4  # raster points per source cell along each axis, over which phi is ave
 SEEN, MANY = 8, 4096  # FINE at least; beyond that, at most so many points along an axis
 #: Transport error at which sites whose cells the raster misses are merged with neighbours, for convergence; most repetitions.
 MERGED, ROUNDS = 5e-3, 4
-SCATTERED, NEARBY = 2e-3, 16  # MERGED of scattered sites, many of them at the edge of the light, and with how many neighbours
-#: Of scattered sites: tolerance in that of others, since what is left is the light of a few sites at the edge, and steps after
-#: which those whose cells are still empty are merged.
-STRICTER, STEPS = 0.25, 2
+STRICTER = 0.2  # tolerance of scattered sites in that of others: what is left is the light of a few, at the edge of the source
 COVERED = 0.99  # part of the scattered sites that move by no more than the map is widened for its first prices
 LEAST = 128  # raster points along an axis
 LEVELS = (64, 16, 4, 1)  # ratios of the number of sites on the finest level to that on each level
@@ -133,6 +130,10 @@ class _Envelope:
     def on(self, x1: np.ndarray, x2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As of `laguerre.envelope`."""
         return laguerre.envelope(self.psi, *self.sites.lines, x1, x2)
+
+    def borders(self, site: np.ndarray) -> tuple[np.ndarray, ...]:
+        """As of `laguerre.borders`; site: as `on` a raster."""
+        return laguerre.borders(site, len(self.psi))
 
     def touched(self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list) -> tuple[np.ndarray, np.ndarray]:
         """Prices at which the planes of these sites, indices (k,), touch phi, and the sites where they do, (k,) each; phi, site: as
@@ -255,22 +256,18 @@ def solve_displaced(
     spread = [np.quantile(np.abs(d), COVERED) / h for d, h in zip((moved.y1 - sites.y1, moved.y2 - sites.y2), (a, b), strict=True)]
     phi = phi + 0.5 * (spread[0] * raster[0][:, None] ** 2 + spread[1] * raster[1] ** 2)  # whose map reaches the outermost sites
     psi, light = moved.prices(phi, raster)[0], _light(f, 0.0, raster, a, b)
-    tolerance *= STRICTER
-    psi, error, taken = _newton(psi, moved, raster, light, max(tolerance, SCATTERED), most)
-    psi, moved, error, more = _without_empty(psi, moved, error, taken, raster, light, tolerance, STEPS, NEARBY)
-    return _map(psi, moved, shape, (a, b), smooth, error, taken + more, began)
+    psi, error, taken = _newton(psi, moved, raster, light, STRICTER * tolerance, most)
+    return _map(psi, moved, shape, (a, b), smooth, error, taken, began)
 
 
-def _without_empty(
-    psi, sites: _Sites, error: float, taken: int, raster: list, light: tuple, tolerance: float, most: int, nearby: int = 1
-) -> tuple:
+def _without_empty(psi, sites: _Sites, error: float, taken: int, raster: list, light: tuple, tolerance: float, most: int) -> tuple:
     """Prices, sites, error, and steps taken: Newton's method without the sites whose cells the raster misses, after it has stopped
-    with them at `error` after `taken` steps; nearby: see `_merged`."""
+    with them at `error` after `taken` steps."""
     steps = 0
     for _ in range(ROUNDS):
         if error < tolerance or taken == 0:
             break
-        psi, sites = _merged(psi, sites, raster, nearby)
+        psi, sites = _merged(psi, sites, raster)
         psi, error, taken = _newton(psi, sites, raster, light, tolerance, most)
         steps += taken
     return psi, sites, error, steps
@@ -435,16 +432,14 @@ def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, fl
     return phi[pad[0] : -pad[0], pad[1] : -pad[1]]
 
 
-def _merged(psi: np.ndarray, sites: _Sites, raster: list, nearby: int = 1) -> tuple[np.ndarray, _Sites]:
-    """Prices and sites without those whose cells contain no raster point; their mass is added to so many of the nearest ones."""
+def _merged(psi: np.ndarray, sites: _Sites, raster: list) -> tuple[np.ndarray, _Sites]:
+    """Prices and sites without those whose cells contain no raster point; their mass is added to the nearest ones."""
     _, site = sites.envelope(psi).on(*raster)
     seen = np.zeros(len(psi), bool)
     seen[site.ravel()] = True
     at = np.column_stack([sites.y1, sites.y2])
-    left = np.count_nonzero(seen)
-    nearby = min(nearby, left)
-    nearest = cKDTree(at[seen]).query(at[~seen], nearby)[1]
-    mass = sites.mass[seen] + np.bincount(nearest.ravel(), np.repeat(sites.mass[~seen] / nearby, nearby), left)
+    nearest = cKDTree(at[seen]).query(at[~seen])[1]
+    mass = sites.mass[seen] + np.bincount(nearest, sites.mass[~seen], np.count_nonzero(seen))
     return psi[seen], sites.without(seen, mass)
 
 
@@ -452,16 +447,16 @@ def _cells(psi: np.ndarray, sites: _Sites, raster: list, light: tuple) -> tuple:
     """Prices (those of empty cells lowered until they touch phi), masses of the cells, and the sparse Jacobian as a graph."""
     envelope = sites.envelope(psi)
     phi, site = envelope.on(*raster)
-    seen = np.zeros(len(psi), bool)
-    seen[site.ravel()] = True
-    missing, touched, bond = np.flatnonzero(~seen), np.zeros(0, np.int64), np.zeros(0)
+    net = envelope.borders(site)
+    mass, weight = laguerre.cells(psi, sites.y1, sites.y2, site, *net, *light)
+    empty = mass == 0.0
+    empty[site.ravel()] = False
+    missing, touched, bond = np.flatnonzero(empty), np.zeros(0, np.int64), np.zeros(0)
     if len(missing):
         psi = psi.copy()
         psi[missing], touched = envelope.touched(missing, phi, site, raster)
         distance = np.hypot(sites.y1[missing] - sites.y1[touched], sites.y2[missing] - sites.y2[touched])
         bond = BOND * np.sqrt(sites.mass[missing] * light[0].mean()) / distance
-    net = laguerre.borders(site, len(psi))
-    mass, weight = laguerre.cells(psi, sites.y1, sites.y2, site, *net, *light)
     return psi, mass, (*net[:3], weight, mass, sites.mass, missing, touched, bond)
 
 

@@ -59,17 +59,19 @@ class Spread:
     frame: tuple[float, float] = (0.0, 0.0)
     #: Of an image that is sheared (a, b): a point (x, y) of the image as given by the other fields lies at (x + a y, y + b x).
     skew: tuple[float, float] = (0.0, 0.0)
-    #: Whether x and y are nearer to the source's y and x: parts of the source cannot be told apart then.
-    turned: bool = False
+    #: Rotation or reflection of a round source about its centre before its image as given by the other fields.
+    turn: tuple[tuple[float, float], tuple[float, float]] = ((1.0, 0.0), (0.0, 1.0))
+    #: Whether x and y are nearer to the y and x of a source that is not round: its parts cannot be told apart then.
+    exchanged: bool = False
 
     @classmethod
     def of(cls, source: Source, by: np.ndarray, error: float = 0.0, usual: float = 0.0) -> Spread:
         """That of a source whose points land displaced by the matrix `by`, (2, 2): mm per mm, or per direction sine."""
         frame, half = source.frame, [math.sin(source.half_angle)] * 2 if source.distant else source.extent
-        exchanged = abs(by[0, 0] * by[1, 1]) < abs(by[0, 1] * by[1, 0])
+        exchanged, turn = abs(by[0, 0] * by[1, 1]) < abs(by[0, 1] * by[1, 0]), np.eye(2)
         if exchanged and source.even and half[0] == half[1]:  # a round source looks the same turned: polar decomposition
-            u, s, _ = np.linalg.svd(by)
-            by = (u * s) @ u.T
+            u, s, v = np.linalg.svd(by)
+            by, turn, exchanged = (u * s) @ u.T, u @ v, False
         sx, sy = (float(c) for c in np.diag(by))
         skew = tuple(float(by[i, 1 - i]) / s if s else 0.0 for i, s in ((0, sy), (1, sx)))
         places: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 1.0),)
@@ -86,6 +88,7 @@ class Spread:
             source.brightness,
             (sx * frame[0], sy * frame[1]),
             (skew[0], skew[1]),
+            ((float(turn[0, 0]), float(turn[0, 1])), (float(turn[1, 0]), float(turn[1, 1]))),
             bool(exchanged),
         )
 
@@ -113,6 +116,7 @@ class Spread:
         All kernels have one shape; the sum of a kernel is its part's fraction of the power times the number of parts.
         """
         cut = _cut(min(h for h in self.half if h > 0) / math.sqrt(len(places)), pixel, most)
+        places = [tuple(p) for p in np.array(places) @ np.array(self.turn).T]
         cell = (pixel[0] / cut, pixel[1] / cut)
         kernels = [self.kernel(cell, (places, k)) for k in range(len(places))]
         a, b = (max(kernel.shape[axis] for kernel in kernels) for axis in (0, 1))  # all are odd

@@ -11,30 +11,42 @@ from caustic_cli.scene import Scene
 
 #: Decentre for the measurement in a scene without one, mm.
 AMOUNT = 1.0
+#: Distance that is rounding, mm.
+SAME = 1e-6
 
 
 class ScreenShift(Effect):
-    """Without it the screen is centred on the axis."""
+    """Without it the screen is centred on the undeviated light, which is the axis unless the source is tilted."""
 
     name = "screen-shift"
     free = True
 
     def decide(self, scene: Scene, bounds) -> Decision:
         """Needed if the screen is decentred."""
-        (a, b), some = scene.screen.shift, any(scene.screen.shift)
+        (a, b), (x, y) = scene.screen.shift, _centre(scene)
+        off = max(abs(a - x), abs(b - y))
+        axis = "in the light" if x or y else "on the axis"
         return Decision(
             self.name,
-            some,
-            f"the screen is shifted by {a:g} and {b:g} mm" if some else "the screen is on the axis",
-            max(abs(a), abs(b)),
+            off > SAME,
+            f"the screen is shifted by {a:g} and {b:g} mm" if off > SAME else f"the screen is {axis}",
+            off if off > SAME else 0.0,
             0.0,
-            present=some,
+            present=off > SAME,
         )
 
     def without(self, scene: Scene) -> Scene:
-        """With a centred screen."""
-        return replace(scene, screen=replace(scene.screen, shift=(0.0, 0.0))) if any(scene.screen.shift) else scene
+        """With a screen centred on that light."""
+        needed = self.decide(scene, None).on
+        return replace(scene, screen=replace(scene.screen, shift=_centre(scene))) if needed else scene
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe:
         """A decentre along x."""
-        return Probe(replace(scene, screen=replace(scene.screen, shift=(AMOUNT, 0.0))), None, f"{AMOUNT:g} mm")
+        x, y = _centre(scene)
+        return Probe(replace(scene, screen=replace(scene.screen, shift=(x + AMOUNT, y))), None, f"{AMOUNT:g} mm")
+
+
+def _centre(scene: Scene) -> tuple[float, float]:
+    """Where the undeviated light meets the screen's plane, mm."""
+    x, y, z = scene.undeviated
+    return scene.screen.z * x / z + 0.0, scene.screen.z * y / z + 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from torch import Tensor
@@ -11,29 +12,41 @@ from caustic_cli.scene import Scene
 
 #: Tilt for the measurement in a scene without one, degrees.
 AMOUNT = 10.0
+#: Difference of two tilts that is rounding, degrees.
+SAME = 1e-6
 
 
 class ScreenTilt(Effect):
-    """Without it the screen is perpendicular to the axis."""
+    """Without it the screen is square to the undeviated light, which is that of the axis unless the source is tilted."""
 
     name = "screen-tilt"
 
     def decide(self, scene: Scene, bounds) -> Decision:
-        """Needed if the screen is tilted."""
-        tilt, some = scene.screen.tilt, any(scene.screen.tilt)
+        """Needed if the screen is tilted to that light."""
+        tilt, square = scene.screen.tilt, _square(scene)
+        off = max(abs(a - b) for a, b in zip((*tilt, 0.0), (*square, 0.0), strict=False))
+        upright = "square to the light" if any(square) else "upright"
         return Decision(
             self.name,
-            some,
-            f"the screen is tilted by {' and '.join(f'{t:g}' for t in tilt)} degrees" if some else "the screen is upright",
-            max(map(abs, tilt)),
+            off > SAME,
+            f"the screen is tilted by {' and '.join(f'{t:g}' for t in tilt)} degrees" if off > SAME else f"the screen is {upright}",
+            off if off > SAME else 0.0,
             0.0,
-            present=some,
+            present=off > SAME,
         )
 
     def without(self, scene: Scene) -> Scene:
-        """With an upright screen."""
-        return replace(scene, screen=replace(scene.screen, tilt=(0.0, 0.0))) if any(scene.screen.tilt) else scene
+        """With a screen square to that light."""
+        needed = self.decide(scene, None).on
+        return replace(scene, screen=replace(scene.screen, tilt=_square(scene))) if needed else scene
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe:
         """A tilt about y."""
-        return Probe(replace(scene, screen=replace(scene.screen, tilt=(0.0, AMOUNT))), None, f"{AMOUNT:g} degrees")
+        about_x, about_y = _square(scene)
+        return Probe(replace(scene, screen=replace(scene.screen, tilt=(about_x, about_y + AMOUNT))), None, f"{AMOUNT:g} degrees")
+
+
+def _square(scene: Scene) -> tuple[float, float]:
+    """Tilt of a screen square to the undeviated light, degrees."""
+    x, y, z = (scene.lens.interaction.side * c for c in scene.undeviated)
+    return math.degrees(-math.asin(y)) + 0.0, math.degrees(math.atan2(x, z)) + 0.0

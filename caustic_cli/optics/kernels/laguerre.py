@@ -18,6 +18,7 @@ from caustic_cli.optics.kernels.jit import njit
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 MISSED = 16  # cuts added to a cell after those of its neighbours on the raster
+REACH = 4  # of a step of `climbed`, points of the raster
 TASKS = 32  # parts of the sites, in each of which cells are cut by one thread
 
 
@@ -157,6 +158,89 @@ def _walked(i, y1, y2, psi, first, other, begin, x1, x2, phi, site):
                 break
             p = there
         phi[i, j], site[i, j] = best, p
+
+
+def adjacency(triangles, sites):
+    """Neighbours of each of so many sites in a triangulation, triangles (k, 3) int32: those of p are other[first[p]..first[p + 1]],
+    ascending."""
+    first, other = np.zeros(sites + 1, np.int64), np.empty(6 * len(triangles), np.int32)
+    return first, other[: _adjacency(triangles, first, other)]
+
+
+@njit(entry=True, nogil=True)
+def _adjacency(triangles, first, other):
+    """Fills both; the number of entries: every inner edge is listed by two triangles, and kept once."""
+    n = len(first) - 1
+    for t in range(len(triangles)):
+        for k in range(3):
+            first[triangles[t, k] + 1] += 2
+    for p in range(n):
+        first[p + 1] += first[p]
+    fill = first[:-1].copy()
+    for t in range(len(triangles)):
+        for k in range(3):
+            p = triangles[t, k]
+            other[fill[p]], other[fill[p] + 1] = triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]
+            fill[p] += 2
+    used = 0
+    for p in range(n):
+        own = np.sort(other[first[p] : fill[p]])
+        first[p] = used
+        for k in range(len(own)):
+            if k == 0 or own[k] != own[k - 1]:
+                other[used] = own[k]
+                used += 1
+    first[n] = used
+    return used
+
+
+@njit(entry=True, nogil=True)
+def linked(first, other, sites):
+    """As of `borders`, of the first `sites` of those of an `adjacency`."""
+    head, degree = np.full(sites, -1, np.int32), np.zeros(sites, np.int32)
+    link, end = np.empty(len(other), np.int32), np.empty(len(other), np.int32)
+    count = 0
+    for p in range(sites):
+        for e in range(first[p], first[p + 1]):
+            q = other[e]
+            if p < q < sites:
+                end[count], link[count], head[p] = q, head[p], count
+                end[count + 1], link[count + 1], head[q] = p, head[q], count + 1
+                degree[p] += 1
+                degree[q] += 1
+                count += 2
+    return head, link[:count], end[:count], degree
+
+
+def climbed(phi, y1, y2, x1, x2, begin):
+    """psi_p and where, as of `prices`, by climbing x . y_p - phi(x), which is concave, from a point of the raster near it.
+
+    Args:
+        begin: (N,) indices i m + j.
+    """
+    psi, at = np.empty(len(y1)), begin.copy()
+    _climbed(ALL, phi, y1, y2, x1, x2, psi, at)
+    return psi, at
+
+
+@njit(entry=True, nogil=True)
+def _climbed(task, phi, y1, y2, x1, x2, psi, at):
+    """`climbed` for one of TASKS parts of the sites."""
+    if task == ALL:
+        on_threads(TASKS, (phi, y1, y2, x1, x2, psi, at))
+        return
+    n, m = phi.shape
+    for p in range(task * len(psi) // TASKS, (task + 1) * len(psi) // TASKS):
+        best, there, middle = -np.inf, at[p], np.int64(-1)
+        while there != middle:
+            middle = there
+            i, j = middle // m, middle % m
+            for k in range(max(i - REACH, 0), min(i + REACH + 1, n)):
+                for r in range(max(j - REACH, 0), min(j + REACH + 1, m)):
+                    value = x1[k] * y1[p] + x2[r] * y2[p] - phi[k, r]
+                    if value > best:
+                        best, there = value, k * m + r
+        psi[p], at[p] = best, there
 
 
 def averages(phi, site, y1, y2, weights, step, low, out) -> None:
@@ -343,7 +427,10 @@ def _cells(task, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mas
             area += 0.5 * ((px[k] - px[0]) * (py[k + 1] - py[0]) - (px[k + 1] - px[0]) * (py[k] - py[0]))
         if not area > 0.0:
             continue
-        mass[p] = area * level[p]
+        light = level[p]
+        if not light > 0.0:  # too narrow for the raster
+            light = density(f, np.mean(px[:n]), np.mean(py[:n]), a, b)
+        mass[p] = area * light
         for k in range(n):
             if po[k] >= 0:
                 k1 = k + 1 if k + 1 < n else 0

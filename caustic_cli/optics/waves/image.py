@@ -253,7 +253,7 @@ def _parts_of(optics: Optics, extended: bool, receiver: Receiver, blur: float) -
     if spread is None:
         return POINT, each
     parts = (spread.error / (ALLOWED * max(blur, *receiver.pixel))) ** 2
-    each = 0 if parts <= 1.0 or spread.turned else min(each, math.ceil(parts))
+    each = 0 if parts <= 1.0 or spread.exchanged else min(each, math.ceil(parts))
     return (POINT if each and not max(spread.half) > 0 else spread), each
 
 
