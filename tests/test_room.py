@@ -12,7 +12,7 @@ from helpers import write_blob
 from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.projection import seen_by_light
+from caustic_cli.inverse.projection import seen_by_light, stretching_surface
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.coherent import modes, spots
 from caustic_cli.optics.spread import spread_at
@@ -174,6 +174,28 @@ def test_nonsense_is_refused_in_a_line(in_tmp, capfd, options, words):
     assert design(*options) == 2
     error = capfd.readouterr().err
     assert words in error.splitlines()[-1] and "Traceback" not in error
+
+
+@pytest.mark.parametrize("place", ["floor:1000", "floor:1000,90", "wall:1000,0", "wall:500,270"])
+def test_the_surface_that_stands_for_a_lens_before_its_design(place):
+    """It spreads tilted light over the screen, a plane in the room, where the offset sphere does not."""
+    source = PlaneWave(tilt=(40.0, 20.0))
+    at = placed(place, SOUTH, source.axis, 1)
+    lens = Lens((30.0, 30.0), control=(24, 24), degree=(3, 3), offset=Offset(3.0, (80.0, 80.0)))
+    scene = Scene(source, lens, Screen((300.0, 300.0), at.z, (60, 60), at.tilt, at.shift))
+    field = HeightField.of(lens)
+    x, y = (c.numpy() for c in field.control_xy())
+
+    def spread(z: np.ndarray) -> np.ndarray:
+        """Standard deviations of the light along both axes of a screen three times as wide, over those of a uniform square of the
+        first one's size."""
+        wide = replace(scene, screen=replace(scene.screen, size=(900.0, 900.0)))
+        seen = expose(wide, field, torch.from_numpy(z), rays_of(wide, "grid", 1 << 16)).image.numpy()
+        c, parts = np.linspace(-443.0, 443.0, 60), [seen.sum(1 - k) / seen.sum() for k in (0, 1)]
+        return np.array([math.sqrt(float(p @ (c - p @ c) ** 2)) for p in parts]) * math.sqrt(12.0) / 300.0
+
+    assert np.abs(spread(stretching_surface(scene, x, y)) - 1.0).max() < 0.1
+    assert np.abs(spread(lens.offset.heights(x, y)) - 1.0).max() > 1.0
 
 
 @pytest.mark.parametrize("place", ["floor:1000", "floor:1000,90", "wall:500,270", "wall:1000,0"])

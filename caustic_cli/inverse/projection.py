@@ -147,6 +147,11 @@ class BeamProjection(ScreenProjection):
         """Slopes along x and y of a plane surface that sends the light to the centre of the screen, to first order."""
         return [(c - self.distance * d) / self.gain(index) for c, d in zip(self._linear[0], self.beam[:2], strict=True)]
 
+    @property
+    def linear(self) -> np.ndarray:
+        """Derivatives of (u, v) by the screen's coordinates at its centre, (2, 2)."""
+        return self._linear[1]
+
     @cached_property
     def _linear(self) -> tuple[np.ndarray, np.ndarray]:
         """(u, v) of the screen's centre, mm, and its derivatives by the screen's coordinates, (2, 2)."""
@@ -186,6 +191,21 @@ class BeamProjection(ScreenProjection):
         a, b = u / self.distance, v / self.distance
         along = np.sqrt(np.maximum(1.0 - a * a - b * b, 0.0))
         return np.stack([a, b, self.forward * along]).reshape(3, -1)
+
+
+def stretching_surface(scene: Scene, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Heights (n, m), mm, at x (n,), y (m,) of the quadratic surface that in tilted light stretches the lens onto the screen, to
+    first order: the optimal map between normal distributions of their second moments (Olkin & Pukelsheim, Linear Algebra Appl. 48,
+    1982)."""
+    screen, lens = scene.screen, scene.lens
+    to = BeamProjection(screen, lens.offset.thickness, lens.interaction.side, scene.source.axis)
+    half, across = np.diag(lens.half_size), to.linear @ np.diag(screen.half_size)
+    values, vectors = np.linalg.eigh(half @ across @ across.T @ half)
+    stretch = np.linalg.solve(half, vectors @ np.diag(np.sqrt(values)) @ vectors.T) @ np.linalg.inv(half) - np.diag(to.axial_scale)
+    index = lens.effective_index
+    at = np.stack(np.broadcast_arrays(x[:, None], y[None, :]))
+    bent = 0.5 / to.gain(index) * np.einsum("iab,ij,jab->ab", at, stretch, at)
+    return lens.offset.thickness + np.tensordot(to.lean(index), at, 1) + bent
 
 
 def seen_by_light(scene: Scene, target: np.ndarray) -> tuple[Scene, np.ndarray]:

@@ -18,6 +18,7 @@ import torch
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import at_most
 from caustic_cli.inverse.deconvolution import BOUND_STEPS, BOUND_WORK, FINEST, NO_ERROR, Deconvolved, deconvolved, error_bound
+from caustic_cli.inverse.projection import stretching_surface
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.emission.coherent import modes, spots
@@ -125,7 +126,7 @@ def source_spread(scene: Scene, field: HeightField | None = None, heights: torch
         scene = replace(scene, lens=replace(scene.lens, control=(NET, NET), knots=None, array=(1, 1)))
         field = HeightField.of(scene.lens)
         x, y = (c.numpy() for c in field.control_xy())
-        heights = torch.from_numpy(scene.lens.offset.heights(x, y))
+        heights = torch.from_numpy(stretching_surface(scene, x, y) if scene.source.oblique else scene.lens.offset.heights(x, y))
     found = spread_at(scene, field, heights)
     if found is None or found.usual > SHIFTS * max(found.reach()) or max(found.reach()) > max(scene.screen.size):
         return None
