@@ -320,7 +320,7 @@ def test_cells_fill_the_rectangle():
     def areas(psi):
         _, site = laguerre.envelope(psi, rows, first, y2, *raster)
         net = laguerre.borders(site, len(psi))
-        return net, laguerre.cells(psi, y1, y2, site, *net, np.full((1, 1), 0.25), np.full((1, 1), 0.25), 1.0, 1.0)
+        return net, laguerre.cells(psi, y1, y2, site, *net, np.full((1, 1), 0.25), np.full((1, 1), 0.25), 1.0, 1.0, transport.WHOLE)
 
     net, (mass, weight) = areas(psi)
     assert mass.sum() == pytest.approx(1.0, abs=1e-4)
@@ -382,6 +382,27 @@ def test_the_envelope_of_scattered_sites(n):
     planes = sites.y1 * x1[:, None, None] + sites.y2 * x2[None, :, None] - phi[:, :, None]
     np.testing.assert_allclose(back, planes.reshape(-1, n).max(0), rtol=0, atol=1e-14)
     np.testing.assert_allclose(planes.reshape(-1, n)[at, np.arange(n)], back, rtol=0, atol=1e-14)
+
+
+def covered(n: int, m: int, a: float, b: float, parts: int = 8) -> np.ndarray:
+    """How much of each cell of a rectangle its ellipse covers, (n, m)."""
+    x, y = transport.centres(n * parts, a)[:, None], transport.centres(m * parts, b)[None, :]
+    return ((x / a) ** 2 + (y / b) ** 2 <= 1).reshape(n, parts, m, parts).mean((1, 3))
+
+
+@pytest.mark.parametrize("bright", [0.0, 1.0])
+def test_round_source(bright):
+    """Uniform or brighter towards one side: onto its own light, enlarged, the map is the enlargement, and no step is wasted on the
+    dark corners."""
+    x, y = transport.centres(96, A)[:, None], transport.centres(80, B)[None, :]
+    light = covered(96, 80, A, B) * (2.0 + bright * x / A)
+    found = transport.solve(light, light, (A, B), (C, C * B / A), tolerance=1e-3)
+    assert found.error < 1e-3
+    assert found.steps < 15
+    x, y = corners(96, 80)
+    inside = (x / A) ** 2 + (y / B) ** 2 < 0.75
+    for got, own in ((found.x, x), (found.y, y)):
+        assert np.abs(got - C / A * own)[inside].max() < 0.6 * 2.0 * C / 96
 
 
 def test_cells_between_the_points_of_the_raster():

@@ -51,14 +51,18 @@ class Scattered:
         """The same displaced from their own places, by (N,) mm along each axis."""
         return replace(self, y1=self.home[0] + by1, y2=self.home[1] + by2)
 
-    def prices(self, phi: np.ndarray, raster: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Prices (N,), mm^2, at which the planes of the sites touch phi on a raster, and where, as of `laguerre.prices`: climbing
-        from the nearest of every few points by the gradient of phi."""
+    def prices(self, phi: np.ndarray, raster: list, inside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Prices (N,), mm^2, at which the planes of the sites touch phi on a raster, or on its part `inside`, and where, as of
+        `laguerre.prices`: climbing from the nearest of every few points by the gradient of phi."""
         few = [slice(None, None, max(1, min(EVERY, len(x) // 2))) for x in raster]
         slopes = np.stack(np.gradient(phi[few[0], few[1]], *(x[every] for x, every in zip(raster, few, strict=True))))
-        nearest = cKDTree(slopes.reshape(2, -1).T).query(np.column_stack([self.y1, self.y2]))[1]
-        i, j = np.unravel_index(nearest, slopes.shape[1:])
-        return laguerre.climbed(phi, self.y1, self.y2, *raster, i * few[0].step * phi.shape[1] + j * few[1].step)
+        begin = np.arange(phi.size).reshape(phi.shape)[few[0], few[1]].ravel()
+        slopes = slopes.reshape(2, -1)
+        if inside is not None:
+            lit = inside.ravel()[begin]
+            begin, slopes, phi = begin[lit], slopes[:, lit], np.where(inside, phi, np.inf)
+        nearest = cKDTree(slopes.T).query(np.column_stack([self.y1, self.y2]))[1]
+        return laguerre.climbed(phi, self.y1, self.y2, *raster, begin[nearest])
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +100,12 @@ class LowerHull:
         first, other = self.neighbours
         return laguerre.walked(*self.planes, first, other, int(other[0]), x1, x2)
 
-    def touched(self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list) -> tuple[np.ndarray, np.ndarray]:
-        """Prices at which the planes of these sites, indices (k,), touch phi, and the sites where they do, (k,) each; phi, site: as
-        `on` the raster."""
+    def touched(
+        self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list, inside
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As of those on rows."""
         s = self.sites
-        back, at = replace(s, y1=s.y1[missing], y2=s.y2[missing]).prices(phi, raster)
+        back, at = replace(s, y1=s.y1[missing], y2=s.y2[missing]).prices(phi, raster, inside)
         return back, site.ravel()[at].astype(np.int64)
 
 

@@ -27,11 +27,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from caustic_cli.errors import InputError
 from caustic_cli.loading import OnDemand
@@ -58,6 +59,8 @@ COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
 EVENER = (1.0, 0.7, 0.4, 0.2, 0.1, 0.03, 0.0)  # continuation in the fraction of uniform light, if a level fails otherwise
 DARKEST = 1e-3  # lower bound of the source over its mean: a cell without light has no derivative
 MAX_CELLS = 4096
+#: No sides of a source (`laguerre.cells`), part of the rectangle above which none are needed, and those of qhull's equations.
+WHOLE, NEARLY_ALL, OUTWARD = np.zeros((0, 3)), 0.99, (1.0, 1.0, -1.0)
 #: Width of the average of phi in `finer`, in its cells, which are smaller than the Laguerre cells.
 SHARP = 0.75
 STRIP = 128  # columns of corners averaged together, which bounds the memory
@@ -105,9 +108,9 @@ class _Sites:
     def lines(self) -> tuple:
         return self.rows, self.first, self.y2
 
-    def prices(self, phi: np.ndarray, raster: list) -> tuple[np.ndarray, np.ndarray]:
-        """As of `laguerre.prices`."""
-        return laguerre.prices(np.ascontiguousarray(phi), *self.lines, *raster)
+    def prices(self, phi: np.ndarray, raster: list, inside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """As of `laguerre.prices`, on the part `inside` of the raster."""
+        return laguerre.prices(np.ascontiguousarray(phi if inside is None else np.where(inside, phi, np.inf)), *self.lines, *raster)
 
     def envelope(self, psi: np.ndarray) -> _Envelope:
         """phi of these sites at these prices."""
@@ -135,10 +138,12 @@ class _Envelope:
         """As of `laguerre.borders`; site: as `on` a raster."""
         return laguerre.borders(site, len(self.psi))
 
-    def touched(self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list) -> tuple[np.ndarray, np.ndarray]:
+    def touched(
+        self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list, inside
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Prices at which the planes of these sites, indices (k,), touch phi, and the sites where they do, (k,) each; phi, site: as
-        `on` the raster."""
-        back, at = self.sites.prices(phi, raster)
+        `on` the raster, whose part `inside` counts."""
+        back, at = self.sites.prices(phi, raster, inside)
         return back[missing], site.ravel()[at[missing]].astype(np.int64)
 
 
@@ -150,6 +155,22 @@ class _Solved:
     sites: _Sites
     shape: tuple[int, int]
     half: tuple[float, float]
+
+
+class _Light(NamedTuple):
+    """The source on a raster: cell values, these sampled, half sizes, and sides of the part outside of which it is dark, as of
+    `laguerre.cells`; inside: that part of the raster, or None for all."""
+
+    cells: np.ndarray
+    values: np.ndarray
+    a: float
+    b: float
+    sides: np.ndarray
+    inside: np.ndarray | None
+
+    def seen(self, site: np.ndarray) -> np.ndarray:
+        """Sites on the raster, -1 where it is dark."""
+        return site if self.inside is None else np.where(self.inside, site, np.int32(-1))
 
 
 def centres(n: int, half: float, pad: int = 0) -> np.ndarray:
@@ -200,34 +221,38 @@ def solve(
     if not 0.5 <= smooth <= 16:
         raise InputError(f"smooth must be 0.5 to 16 source cells, got {smooth!r}")
     n, m = f.shape
+    most_sites = _most_sites(_normalised(f, darkest, (a, b)), n * m)
+    f, sides = _lit_part(f, a, b)
     f = _normalised(f, darkest, (a, b))
-    most_sites = _most_sites(f, n * m)
     pyramid = _pyramid(g, (c, d), most_sites)
     psi = sites = None
     steps = 0
     for fewer in levels if start is None else LEVELS[-1:]:
         goal = max(most_sites // fewer, 16)
         raster = [centres(_points(s * fewer**-0.5), h) for s, h in ((n, a), (m, b))]
+        inside = _inside(raster, sides)
         old, sites = sites, _sites(pyramid, 1.0 / goal)
         linear = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)  # prices of the map that stretches the rectangle
         if start is not None:
-            psi = sites.prices(_resampled(start, (n, m), (a, b), raster), raster)[0]
+            psi = sites.prices(_resampled(start, (n, m), (a, b), raster), raster, inside)[0]
         else:
-            psi = linear if old is None else _refined(psi, old, sites, raster, (a, b))
+            psi = linear if old is None else _refined(psi, old, sites, raster, (a, b), sides)
         enough = max(tolerance, MERGED) if fewer == levels[-1] else COARSE_TOLERANCE
-        found, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b), enough, most)
+        found, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b, sides), enough, most)
         steps += taken
-        failed = error > 10.0 * enough and f.size > 1  # Newton's method, in dark regions of the source
+        failed = error > 10.0 * enough and (f.size > 1 or len(sides) > 0)  # Newton's method, in dark regions of the source
         if failed and start is not None:  # which were lit where the initial potential comes from
             options = {"smooth": smooth, "tolerance": tolerance, "most": most, "darkest": darkest}
             again = solve(source, target, source_half, target_half, **options)
             return replace(again, steps=steps + again.steps, seconds=time.perf_counter() - began)
         if failed:  # continuation from uniform light
-            *other, taken, all_taken = _continued(linear, sites, raster, f, (a, b), enough, most)
+            *other, taken, all_taken = _continued(linear, sites, raster, f, (a, b), enough, most, sides)
             steps += all_taken
             found, error = min((found, error), other, key=lambda pair: pair[1])
         psi = found
-    psi, sites, error, taken = _without_empty(psi, sites, error, taken, raster, _light(f, 0.0, raster, a, b), tolerance, most)
+    psi, sites, error, taken = _without_empty(
+        psi, sites, error, taken, raster, _light(f, 0.0, raster, a, b, sides), tolerance, most
+    )
     return _map(psi, sites, (n, m), (a, b), smooth, error, steps + taken, began)
 
 
@@ -246,16 +271,18 @@ def solve_displaced(
     kernels.blocks()
     f, (a, b) = _density("source", source), _halves("source", source_half)
     shape = f.shape
+    f, sides = _lit_part(f, a, b)
     f = _normalised(f, darkest, (a, b))
     raster = [centres(max(FINE * n, LEAST), h) for n, h in zip(shape, (a, b), strict=True)]
     phi = _resampled(potential, shape, (a, b), raster)
-    at = sites.prices(phi, raster)[1]
+    light = _light(f, 0.0, raster, a, b, sides)
+    at = sites.prices(phi, raster, light.inside)[1]
     where = [x[i] for x, i in zip(raster, np.unravel_index(at, [len(x) for x in raster]), strict=True)]
     cells = [(0.5 * x / h + 0.5) * n for x, n, h in zip(where, shape, (a, b), strict=True)]
     moved = sites.displaced(*(-ndimage.map_coordinates(c, cells, order=1, mode="nearest") for c in shift))
     spread = [np.quantile(np.abs(d), COVERED) / h for d, h in zip((moved.y1 - sites.y1, moved.y2 - sites.y2), (a, b), strict=True)]
     phi = phi + 0.5 * (spread[0] * raster[0][:, None] ** 2 + spread[1] * raster[1] ** 2)  # whose map reaches the outermost sites
-    psi, light = moved.prices(phi, raster)[0], _light(f, 0.0, raster, a, b)
+    psi = moved.prices(phi, raster, light.inside)[0]
     psi, error, taken = _newton(psi, moved, raster, light, STRICTER * tolerance, most)
     return _map(psi, moved, shape, (a, b), smooth, error, taken, began)
 
@@ -267,7 +294,7 @@ def _without_empty(psi, sites: _Sites, error: float, taken: int, raster: list, l
     for _ in range(ROUNDS):
         if error < tolerance or taken == 0:
             break
-        psi, sites = _merged(psi, sites, raster)
+        psi, sites = _merged(psi, sites, raster, light)
         psi, error, taken = _newton(psi, sites, raster, light, tolerance, most)
         steps += taken
     return psi, sites, error, steps
@@ -299,21 +326,25 @@ def _normalised(f: np.ndarray, darkest: float, half: tuple[float, float]) -> np.
     return f / (f.mean() * 4.0 * half[0] * half[1])
 
 
-def _continued(psi: np.ndarray, sites: _Sites, raster, f: np.ndarray, half: tuple[float, float], enough: float, most: int):
+def _continued(
+    psi: np.ndarray, sites: _Sites, raster, f: np.ndarray, half: tuple[float, float], enough: float, most: int, sides: np.ndarray
+):
     """Prices by Newton's method in steps from uniform light to that of the source, their error, and the numbers of its steps
     for the source and in all."""
     steps = 0
     for even in EVENER:
         tolerance = COARSE_TOLERANCE if even else enough
-        psi, error, taken = _newton(psi, sites, raster, _light(f, even, raster, *half), tolerance, most)
+        psi, error, taken = _newton(psi, sites, raster, _light(f, even, raster, *half, sides), tolerance, most)
         steps += taken
     return psi, error, taken, steps
 
 
-def _refined(psi: np.ndarray, coarser: _Sites, sites: _Sites, raster: list[np.ndarray], half: tuple[float, float]) -> np.ndarray:
+def _refined(
+    psi: np.ndarray, coarser: _Sites, sites: _Sites, raster: list, half: tuple[float, float], sides: np.ndarray
+) -> np.ndarray:
     """Prices of the sites of a level, from those of the coarser one."""
     coarse = [centres(int(ROUGH * len(x)), h) for x, h in zip(raster, half, strict=True)]
-    return sites.prices(_rounded(psi, coarser, coarse, half), coarse)[0]
+    return sites.prices(_rounded(psi, coarser, coarse, half), coarse, _inside(coarse, sides))[0]
 
 
 def _points(cells: float) -> int:
@@ -321,10 +352,57 @@ def _points(cells: float) -> int:
     return max(int(FINE * cells), min(int(SEEN * cells), MANY), LEAST)
 
 
-def _light(f: np.ndarray, even: float, raster: list, a: float, b: float) -> tuple:
-    """Arguments of `laguerre.cells` for the source mixed with a fraction `even` of uniform light."""
+def _light(f: np.ndarray, even: float, raster: list, a: float, b: float, sides: np.ndarray = WHOLE) -> _Light:
+    """The source mixed with a fraction `even` of uniform light."""
     lit = (1.0 - even) * f + even * f.mean()
-    return lit, laguerre.sampled(lit, *raster, a, b), a, b
+    return _Light(lit, laguerre.sampled(lit, *raster, a, b), a, b, sides, _inside(raster, sides))
+
+
+def _inside(raster: list, sides: np.ndarray) -> np.ndarray | None:
+    """Points of a raster within these sides, or None without any."""
+    if not len(sides):
+        return None
+    x1, x2 = raster[0][:, None], raster[1][None, :]
+    within = np.ones((len(raster[0]), len(raster[1])), bool)
+    for p, q, c in sides:
+        within &= p * x1 + q * x2 <= c
+    return within
+
+
+def _lit_part(f: np.ndarray, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
+    """A source (n, m) that is dark outside a convex region, continued evenly beyond it, and the region's sides, as of
+    `laguerre.cells`: a polygon through the cells that are half covered, widened to the area of their light.  Of one that fills most
+    of its rectangle no sides, and the source as it is."""
+    lines = [_to_edges(centres(n, h), h) for n, h in zip(f.shape, (a, b), strict=True)]
+    places = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
+    hull = _hull(places[f > 0])
+    if hull is None or hull.volume > NEARLY_ALL * 4.0 * a * b:
+        return f, WHOLE
+    edge = ndimage.binary_dilation((f <= 0) & ~_inside(lines, hull.equations * OUTWARD), np.ones((3, 3), bool))
+    nearest = ndimage.distance_transform_edt(edge, return_distances=False, return_indices=True)
+    even = f[tuple(nearest)]
+    hull = None if edge.all() or not even.min() > 0 else _hull(places[(f > 0) & (f >= 0.5 * even)])
+    if hull is None:
+        return f, WHOLE
+    area = 4.0 * a * b / f.size * float(np.where(edge, f / even, 1.0).sum())
+    ends = hull.points[hull.simplices]
+    fixed = ((ends == (a, b)).all(1) | (ends == (-a, -b)).all(1)).any(1)  # along the edges of the rectangle
+    sides = hull.equations * OUTWARD
+    sides[:, 2] += (area - hull.volume) / np.hypot(*(ends[:, 0] - ends[:, 1]).T)[~fixed].sum()
+    return even, sides
+
+
+def _hull(points: np.ndarray) -> ConvexHull | None:
+    """Convex hull of points (k, 2), None of points on a line."""
+    try:
+        return ConvexHull(points)
+    except QhullError:
+        return None
+
+
+def _to_edges(c: np.ndarray, half: float) -> np.ndarray:
+    """Centres of cells, the outermost moved to the edges of all."""
+    return np.concatenate([[-half], c[1:-1], [half]]) if len(c) > 1 else c
 
 
 def _density(name: str, value) -> np.ndarray:
@@ -432,35 +510,38 @@ def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, fl
     return phi[pad[0] : -pad[0], pad[1] : -pad[1]]
 
 
-def _merged(psi: np.ndarray, sites: _Sites, raster: list) -> tuple[np.ndarray, _Sites]:
+def _merged(psi: np.ndarray, sites: _Sites, raster: list, light: _Light) -> tuple[np.ndarray, _Sites]:
     """Prices and sites without those whose cells contain no raster point; their mass is added to the nearest ones."""
-    _, site = sites.envelope(psi).on(*raster)
+    site = light.seen(sites.envelope(psi).on(*raster)[1])
     seen = np.zeros(len(psi), bool)
-    seen[site.ravel()] = True
+    seen[site[site >= 0]] = True
     at = np.column_stack([sites.y1, sites.y2])
     nearest = cKDTree(at[seen]).query(at[~seen])[1]
     mass = sites.mass[seen] + np.bincount(nearest, sites.mass[~seen], np.count_nonzero(seen))
     return psi[seen], sites.without(seen, mass)
 
 
-def _cells(psi: np.ndarray, sites: _Sites, raster: list, light: tuple) -> tuple:
+def _cells(psi: np.ndarray, sites: _Sites, raster: list, light: _Light) -> tuple:
     """Prices (those of empty cells lowered until they touch phi), masses of the cells, and the sparse Jacobian as a graph."""
     envelope = sites.envelope(psi)
     phi, site = envelope.on(*raster)
-    net = envelope.borders(site)
-    mass, weight = laguerre.cells(psi, sites.y1, sites.y2, site, *net, *light)
+    seen = light.seen(site)
+    net = envelope.borders(seen)
+    mass, weight = laguerre.cells(psi, sites.y1, sites.y2, seen, *net, *light[:-1])
+    if light.inside is not None and (total := mass.sum()):
+        mass, weight = mass / total, weight / total
     empty = mass == 0.0
-    empty[site.ravel()] = False
+    empty[seen[seen >= 0]] = False
     missing, touched, bond = np.flatnonzero(empty), np.zeros(0, np.int64), np.zeros(0)
     if len(missing):
         psi = psi.copy()
-        psi[missing], touched = envelope.touched(missing, phi, site, raster)
+        psi[missing], touched = envelope.touched(missing, phi, site, raster, light.inside)
         distance = np.hypot(sites.y1[missing] - sites.y1[touched], sites.y2[missing] - sites.y2[touched])
-        bond = BOND * np.sqrt(sites.mass[missing] * light[0].mean()) / distance
+        bond = BOND * np.sqrt(sites.mass[missing] * light.cells.mean()) / distance
     return psi, mass, (*net[:3], weight, mass, sites.mass, missing, touched, bond)
 
 
-def _newton(psi, sites: _Sites, raster: list, light: tuple, tolerance: float, most: int) -> tuple[np.ndarray, float, int]:
+def _newton(psi, sites: _Sites, raster: list, light: _Light, tolerance: float, most: int) -> tuple[np.ndarray, float, int]:
     """Damped Newton iteration: prices, transport error, and the number of steps taken."""
     psi, mass, graph = _cells(psi, sites, raster, light)
     excess = mass - sites.mass

@@ -17,6 +17,7 @@ import numpy as np
 from caustic_cli.optics.kernels.jit import njit
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
+BESIDE = ((0, 1), (1, 0), (1, 1), (1, -1))  # points of a raster that are compared with each
 MISSED = 16  # cuts added to a cell after those of its neighbours on the raster
 REACH = 4  # of a step of `climbed`, points of the raster
 TASKS = 32  # parts of the sites, in each of which cells are cut by one thread
@@ -296,7 +297,7 @@ def _join(p, q, head, link, end, degree, count):
 
 @njit(entry=True, nogil=True)
 def borders(site, sites):
-    """Neighbours in a raster of cells, as linked lists of half-borders.
+    """Neighbours in a raster of cells, as linked lists of half-borders; site: -1 outside the source.
 
     Returns:
         head (N,): a site's first half-border or -1; link: the next one; end: the site on its other side; degree (N,).
@@ -309,15 +310,12 @@ def borders(site, sites):
     for i in range(n):
         for j in range(m):
             p = site[i, j]
-            below = i + 1 < n
-            if j + 1 < m and site[i, j + 1] != p and count + 8 < room:
-                count = _join(p, site[i, j + 1], head, link, end, degree, count)
-            if below and site[i + 1, j] != p and count + 8 < room:
-                count = _join(p, site[i + 1, j], head, link, end, degree, count)
-            if below and j + 1 < m and site[i + 1, j + 1] != p and count + 8 < room:
-                count = _join(p, site[i + 1, j + 1], head, link, end, degree, count)
-            if below and j > 0 and site[i + 1, j - 1] != p and count + 8 < room:
-                count = _join(p, site[i + 1, j - 1], head, link, end, degree, count)
+            if p < 0:
+                continue
+            for k in range(4):
+                i1, j1 = i + BESIDE[k][0], j + BESIDE[k][1]
+                if i1 < n and 0 <= j1 < m and site[i1, j1] >= 0 and site[i1, j1] != p and count + 8 < room:
+                    count = _join(p, site[i1, j1], head, link, end, degree, count)
     return head, link[:count], end[:count], degree
 
 
@@ -369,12 +367,17 @@ def _means(site, values, sites):
     """Mean of raster values in each cell, (N,)."""
     if values.size == 1:
         return np.full(sites, values[0, 0])
-    total, count = np.bincount(site.ravel(), values.ravel(), sites), np.bincount(site.ravel(), minlength=sites)
-    return total / np.maximum(count, 1)
+    of = site.ravel() + 1  # the first is outside
+    total, count = np.bincount(of, values.ravel(), sites + 1), np.bincount(of, minlength=sites + 1)
+    return total[1:] / np.maximum(count[1:], 1)
 
 
-def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b):
+def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b, sides):
     """Mass of every cell and d(mass) across every border.
+
+    Args:
+        site: on a raster, -1 outside the source; head, link, end, degree: of `borders`.
+        sides: of a convex source, (k, 3) unit outer normals and distances from the origin, none for the whole rectangle.
 
     Returns:
         mass (N,): source light in the cell, its area times the mean over its raster points of `values`, the source f sampled;
@@ -382,22 +385,22 @@ def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b):
         difference of the two prices (Kitagawa, Merigot & Thibert, J. Eur. Math. Soc. 21, 2019, theorem 1.3).
     """
     mass, weight, level = np.zeros(len(psi)), np.zeros(len(end)), _means(site, values, len(psi))
-    _cells(ALL, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight)
+    _cells(ALL, psi, y1, y2, site, head, link, end, degree, f, level, a, b, sides, mass, weight)
     return mass, weight
 
 
 @njit(entry=True, nogil=True)
-def _cells(task, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight):
+def _cells(task, psi, y1, y2, site, head, link, end, degree, f, level, a, b, sides, mass, weight):
     """`cells` for one of TASKS parts of the sites."""
     if task == ALL:
-        on_threads(TASKS, (psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight))
+        on_threads(TASKS, (psi, y1, y2, site, head, link, end, degree, f, level, a, b, sides, mass, weight))
         return
     low, high = task * len(psi) // TASKS, (task + 1) * len(psi) // TASKS
     room, flat = 0, f.size == 1
     rn, rm = site.shape
     for p in range(low, high):
         room = max(room, degree[p])
-    room = 2 * room + 12 + MISSED
+    room = 2 * room + 12 + MISSED + len(sides)
     px, py, qx, qy = np.empty(room), np.empty(room), np.empty(room), np.empty(room)
     po, qo = np.empty(room, np.int32), np.empty(room, np.int32)
     for p in range(low, high):
@@ -417,11 +420,21 @@ def _cells(task, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mas
             i = min(max(int((px[k] + a) * (0.5 * rn / a)), 0), rn - 1)
             j = min(max(int((py[k] + b) * (0.5 * rm / b)), 0), rm - 1)
             q, k = site[i, j], k + 1
+            if q < 0:
+                continue
             ax, ay, c = y1[q] - y1[p], y2[q] - y2[p], psi[q] - psi[p]
             if q != p and ax * px[k - 1] + ay * py[k - 1] - c > 1e-9 * abs(c):
                 n = _clip(px, py, po, n, ax, ay, c, np.int32(-1), qx, qy, qo)
                 px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
                 k, missed = 0, missed + 1
+        for e in range(len(sides)):
+            ax, ay, c = sides[e, 0], sides[e, 1], sides[e, 2]
+            outside = False
+            for k in range(n):
+                outside = outside or ax * px[k] + ay * py[k] > c
+            if outside:
+                n = _clip(px, py, po, n, ax, ay, c, np.int32(-1), qx, qy, qo)
+                px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
         area = 0.0
         for k in range(1, n - 1):
             area += 0.5 * ((px[k] - px[0]) * (py[k + 1] - py[0]) - (px[k + 1] - px[0]) * (py[k] - py[0]))
