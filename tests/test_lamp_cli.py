@@ -193,6 +193,7 @@ def test_a_project_edited_beyond_its_lens_is_refused(road, capfd):
         (["--lamp", "6", "--angles", "60", "--lamp-inner", "4"], "--lamp of"),
         (["--lamp", "15", "--angles", "60", "--lamp-surfaces", "3"], "--lamp-surfaces must be"),
         (["--lamp", "15", "--angles", "60", "--chip-shape", "star"], "--chip-shape must be"),
+        (["--lamp", "15", "--angles", "60", "--lamp-flange", "2"], "needs the thickness --lamp-base"),
         (["--lamp", "15", "--angles", "60", "--mag", "3"], "--mag is not a setting of a lamp"),
         (["--lamp", "15", "--angles", "60", "--source", "disc"], "--source is not a setting of a lamp"),
         (["--lamp", "15", "--angles", "60", "--lens-size", "20"], "--lens-size is not a setting of a lamp"),
@@ -222,7 +223,9 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
         (["render", "--report"], "--report is for a lens before its light"),
         (["export"], "a --format is needed"),
         (["export", "-o", "a.dat"], "a --format is needed"),
-        (["export", "--format", "step"], "a lamp's surface is none"),
+        (["export", "--format", "heightmap"], "a lamp's surface is none"),
+        (["export", "--format", "zemax"], "step for programs of optical design"),
+        (["export", "--format", "step", "--samples", "9"], "--samples belongs to stl, ply, obj"),
         (["export", "--format", "gcode"], "a lamp's surface is none"),
         (["export", "--format", "stl", "--mould"], "--mould is for a lens before its light"),
         (["export", "--format", "ies", "--samples", "9"], "--samples belongs to stl, ply, obj"),
@@ -240,7 +243,7 @@ def test_what_a_lamp_has_not_is_refused_in_one_line(command, words, road, capfd)
 
 def test_of_several_formats_none_is_written_where_one_is_refused(road, capfd):
     before = set(Path().iterdir())
-    assert "a lamp's surface is none" in refused(capfd, "export", str(road), "--format", "ldt,step")
+    assert "a lamp's surface is none" in refused(capfd, "export", str(road), "--format", "ldt,gcode")
     assert set(Path().iterdir()) == before
 
 
@@ -284,6 +287,23 @@ def test_solids_are_written_and_repeated(format, road, capfd):
         assert int.from_bytes(first[80:84], "little") == 2 * (60 + 19 * 120) + 120
     if format == "obj":
         assert first.count(b"\nv ") == 2 * (1 + 20 * 60)
+
+
+def test_a_foot_is_part_of_the_solid_and_a_step_file_is_repeated(road, capfd):
+    other = road.parent / "foot.caustic"
+    other.mkdir()
+    for file in road.iterdir():
+        (other / file.name).write_bytes(file.read_bytes())
+    text = (road / "project.toml").read_text()
+    (other / "project.toml").write_text(text.replace("[lamp]", "[lamp]\nbase = 1.5\nflange = 2.0"))
+    assert figures_of(capfd, "export", str(other), "--format", "obj", "--samples", "20x60")["file"] == "foot.obj"
+    heights = [float(line.split()[3]) for line in Path("foot.obj").read_text().splitlines() if line.startswith("v ")]
+    assert min(heights) == -1.5
+    figures = figures_of(capfd, "export", str(other), "--format", "step")
+    first = Path("foot.step").read_bytes()
+    assert figures["bytes"] == len(first) and first.count(b"ADVANCED_FACE") == 8
+    assert cli.run(["export", str(other), "--format", "step", "--force", "--quiet"]) == 0
+    assert Path("foot.step").read_bytes() == first
 
 
 # Photometry
@@ -363,7 +383,7 @@ def test_damaged_photometric_files_are_refused_in_one_line(content, words):
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-def test_the_values_of_a_checkpoint_are_those_of_log_r(road):
+def test_the_values_of_a_checkpoint_are_those_of_r(road):
     lamp = LampDesign.of(Project.open(road))
     least, greatest = lamp.field.extent(lamp.values)
     assert lamp.lamp.inner + lamp.lamp.wall < least < greatest < 16.0

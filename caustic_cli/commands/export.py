@@ -45,7 +45,7 @@ class ExportOptions(options.OfDesign, options.Debugging):
             "--format",
             metavar="NAME[,NAME...]",
             help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items())
-            + "; of a lamp stl, ply, obj, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's suffix says;"
+            + "; of a lamp step, stl, ply, obj, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's suffix says;"
             " lighttools]",
         ),
     ] = None

@@ -116,7 +116,7 @@ def lamp_of(settings: Settings) -> Lamp:
     s = settings.lamp
     assert s is not None and s.radius is not None and s.inner is not None
     chip = Chip("point") if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip)
-    return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall, s.surfaces)
+    return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall, s.surfaces, s.base, s.flange)
 
 
 def goal_of(settings: Settings) -> Goal:

@@ -1,4 +1,5 @@
-"""The solid of a lamp as a closed triangle mesh: the outer surface, the inner one and the ring of the base between them.
+"""The solid of a lamp as a closed triangle mesh: the outer surface, the inner one, and between them the ring of the base or
+a foot.
 
 Both surfaces are sampled on rings of the stereographic disc with equal steps of rho, between points at the same angles; the
 innermost ring is a single point on the axis.  Vertices run counter-clockwise seen from outside.
@@ -7,6 +8,7 @@ innermost ring is a single point on the axis.  Vertices run counter-clockwise se
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.export import obj, ply, stl
+from caustic_cli.export.mesh import walls
 from caustic_cli.optics.lamp import sides
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Lamp
@@ -27,6 +30,8 @@ MESHES = {
 }
 #: Rings and points of a ring, unless given; and most of either.
 SAMPLES, MOST = (150, 600), 4000
+#: Points at which the greatest radius of a rim is looked for.
+AROUND = 3600
 
 
 def lamp_mesh(lamp: Lamp, field: PolarField, values: Tensor, samples: tuple[int, int] = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
@@ -44,16 +49,50 @@ def lamp_mesh(lamp: Lamp, field: PolarField, values: Tensor, samples: tuple[int,
     rho = np.repeat(np.arange(1, rings + 1) / rings, around)
     angle = np.tile(2.0 * math.pi * np.arange(around) / around, rings)
     u, v = (torch.from_numpy(np.concatenate([[0.0], rho * f(angle)])) for f in (np.cos, np.sin))
-    inside, free = sides(values.detach())
-    inside = field.sphere(lamp.inner) if inside is None else inside
-    outer, inner = (np.stack([c.numpy() for c in field.points(net, u, v)], 1) for net in (free, inside))
+    both = surfaces_of(lamp, field, values)
+    outer, inner = (np.stack([c.numpy() for c in own.points(net, u, v)], 1) for own, net in both)
     for points in (outer, inner):
         points[-around:, 2] = 0.0  # the rim lies in the base plane, but for rounding
     cap, count = _disc(rings, around), len(outer)
-    rim = np.arange(count - around, count)
-    following = np.roll(rim, -1)
-    base = np.concatenate([np.stack([following, rim, rim + count], 1), np.stack([following, rim + count, following + count], 1)])
-    return np.concatenate([outer, inner]), np.concatenate([cap, cap[:, ::-1] + count, base])
+    vertices, faces = [outer, inner], [cap, cap[:, ::-1] + count]
+    loop, end, total = np.arange(count - around, count), np.arange(2 * count - around, 2 * count), 2 * count
+    for points in _foot(lamp, outer[-around:], inner[-around:], flange_radius(lamp, *both[0]), angle[:around]):
+        following = np.arange(total, total + around)
+        vertices.append(points)
+        faces.append(walls(loop, following))
+        loop, total = following, total + around
+    return np.concatenate(vertices), np.concatenate([*faces, walls(loop, end)])
+
+
+def surfaces_of(lamp: Lamp, field: PolarField, values: Tensor) -> tuple[tuple[PolarField, Tensor], tuple[PolarField, Tensor]]:
+    """The outer and the inner surface with their control values."""
+    inner, outer = sides(values.detach())
+    sphere = PolarField.uniform((4, 4))
+    return (field, outer), (sphere, sphere.sphere(lamp.inner)) if inner is None else (field, inner)
+
+
+def rim_points(field: PolarField, values: Tensor, angle: np.ndarray) -> np.ndarray:
+    """Points (N, 3) mm of a surface in the plane of the chip."""
+    x, y, _ = field.points(values, *(torch.from_numpy(f(angle)) for f in (np.cos, np.sin)))
+    return np.stack([x.numpy(), y.numpy(), np.zeros(len(angle))], 1)
+
+
+def flange_radius(lamp: Lamp, field: PolarField, values: Tensor) -> float:
+    """Radius of the flange, mm: its width beyond the greatest radius of the rim."""
+    angle = 2.0 * math.pi * np.arange(AROUND) / AROUND
+    return lamp.flange + float(np.linalg.norm(rim_points(field, values, angle), axis=1).max())
+
+
+def _foot(lamp: Lamp, rim: np.ndarray, hole: np.ndarray, radius: float, angle: np.ndarray) -> Iterator[np.ndarray]:
+    """Loops of points (k, 3) between the rim of the outer surface and that of the inner one: a flange of this radius, lower edge,
+    opening; at the angles of the rim."""
+    down = np.array([0.0, 0.0, lamp.base])
+    if lamp.flange > 0:
+        rim = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
+        yield rim
+    if lamp.base > 0:
+        yield rim - down
+        yield hole - down
 
 
 def _disc(rings: int, around: int) -> np.ndarray:

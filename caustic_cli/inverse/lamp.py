@@ -147,11 +147,11 @@ def refine(
 
     on_iteration: called with the number of iterations and the loss.
     """
-    spread = InverseLaplacian(values)
+    spread = InverseLaplacian(values)  # of the logarithms of the control values, which keeps them positive
 
     def evaluate(x: Tensor) -> tuple[float, Tensor]:
         y = x.view(values.shape).clone().requires_grad_()
-        loss = objective(values + spread(y))
+        loss = objective(values * spread(y).exp())
         (g,) = torch.autograd.grad(loss, y)
         return float(loss.detach()), g.reshape(-1)
 
@@ -161,11 +161,11 @@ def refine(
             break
         on_iteration(k + 1, method.f)
     with torch.no_grad():
-        return values + spread(method.x.view(values.shape))
+        return values * spread(method.x.view(values.shape)).exp()
 
 
 def initial_lamp(lamp: Lamp, goal: Goal, field: PolarField, picture: np.ndarray, cells: int = CELLS) -> Tensor:
-    """Control values (n, m) of log r by transport of the light of a point to the target, see `refractor_transport`.
+    """Control values (n, m) of r by transport of the light of a point to the target, see `refractor_transport`.
 
     cells: of the light along u and v; the target has as many directions.
     """
@@ -202,7 +202,7 @@ def design_lamp(
     seed: int = 0,
     on_iteration: Callable[[int, int, float], None] = lambda stage, k, loss: None,
 ) -> Tensor:
-    """The surfaces that send the light of a chip to a picture: control values of log r, r in mm, over the spline spaces `field_of`,
+    """The surfaces that send the light of a chip to a picture: control values of r, mm, over the spline spaces `field_of`,
     (n, m) of one or (2, n, m) of two (`optics.lamp.sides`).
 
     Args:
@@ -222,6 +222,8 @@ def design_lamp(
         target = wanted(goal, picture, pixels_of(goal, pixels))
         objective = LampObjective(refined, goal, field, target, rays, stream(seed, f"stage {k}"), weight)
         values = refine(objective, values, iterations, partial(on_iteration, k))
+    if lamp.surfaces == 1:  # the light of one that is a little smaller is the same
+        values = min(1.0, lamp.radius / field.extent(values)[1]) * values
     refuse_thin(lamp, field, values)
     return values
 

@@ -17,8 +17,6 @@ a smooth function of any direction x, and so defined beyond the light.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -74,7 +72,7 @@ def envelope(directions: Vectors, y: Tensor, b: Tensor, g: Tensor, e: float, ind
 
 
 def transported(field: PolarField, y: Tensor, b: Tensor, index: float, radius: float, cells: int = CELLS) -> Tensor:
-    """Control values (n, m) of log r of the refractor that sends the light of a Lambertian point to a target.
+    """Control values (n, m) of r of the refractor that sends the light of a Lambertian point to a target.
 
     Args:
         y, b: the target, as for `refractor_potential`.
@@ -85,6 +83,7 @@ def transported(field: PolarField, y: Tensor, b: Tensor, index: float, radius: f
     g, e = refractor_potential(x, a, y, b, index)
     u, v = field.net.control_xy()
     u, v = (c.reshape(-1) for c in torch.meshgrid(u, v, indexing="ij"))
-    values = field.net.interpolated(envelope(direction_of(u, v), y, b, g, e, index).view(field.shape))
+    log_r = envelope(direction_of(u, v), y, b, g, e, index)
+    values = field.net.interpolated((log_r - log_r.max()).exp().view(field.shape))
     lit = u * u + v * v <= 1.0
-    return values - float(values.reshape(-1)[lit].max()) + math.log(radius)
+    return radius / float(values.reshape(-1)[lit].max()) * values

@@ -130,8 +130,8 @@ class PointGrid:
 
     def hits(self, values: Tensor) -> PolarHit:
         """`PolarField.from_origin` in these directions."""
-        g, gu, gv = (c.reshape(-1).index_select(0, self.lit) for c in self._surface(values))
-        return polar_hit(self.u, self.v, g, gu, gv)
+        r, ru, rv = (c.reshape(-1).index_select(0, self.lit) for c in self._surface(values))
+        return polar_hit(self.u, self.v, r, ru, rv)
 
 
 def sides(values: Tensor) -> tuple[Tensor | None, Tensor]:
@@ -152,7 +152,7 @@ def least_wall(lamp: Lamp, field: PolarField, values: Tensor) -> float:
 
 
 def through_point(lamp: Lamp, field: PolarField, rays: PointGrid, values: Tensor) -> LampLight:
-    """Light of a point at the origin through the lens; differentiable by the control values of log r, see `sides`."""
+    """Light of a point at the origin through the lens; differentiable by the control values of r, see `sides`."""
     inner, outer = sides(values)
     if inner is None:
         return _from_point(lamp, rays.hits(outer), rays.power)
@@ -174,7 +174,7 @@ def _from_point(lamp: Lamp, hit: PolarHit, power: Tensor) -> LampLight:
 
 
 def through(lamp: Lamp, field: PolarField, rays: ChipRays, values: Tensor) -> LampLight:
-    """Light of a chip through the lens; differentiable by the control values of log r, see `sides`."""
+    """Light of a chip through the lens; differentiable by the control values of r, see `sides`."""
     inner, outer = sides(values)
     if lamp.chip.shape == "point":
         at = stereographic(*rays.direction)
@@ -222,8 +222,7 @@ def _meets_again(field: PolarField, inner: Tensor, start: Vectors, end: Vectors)
         found = torch.zeros_like(start[0], dtype=torch.bool)
         for k in range(1, PROBES + 1):
             x, y, z = (a + k / (PROBES + 1) * (b - a) for a, b in zip(start, end, strict=True))
-            g = field.net.evaluate(inner, *stereographic(x, y, z))[0]
-            found |= 0.5 * (x * x + y * y + z * z).log() < g
+            found |= (x * x + y * y + z * z).sqrt() < field.net.evaluate(inner, *stereographic(x, y, z))[0]
         return found
 
 

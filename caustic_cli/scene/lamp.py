@@ -113,12 +113,20 @@ class Lamp:
     wall: float = 1.0
     #: Number of free-form surfaces: with 2 the inner side is one instead of the hemisphere, and `inner` its least radius.
     surfaces: int = 1
+    #: Thickness of the foot below the plane of the chip, and width of its flange beyond the rim of the lens, mm.
+    base: float = 0.0
+    flange: float = 0.0
 
     def __post_init__(self):
         if self.surfaces not in (1, 2):
             raise InputError(f"a lamp has 1 or 2 free-form surfaces, got {self.surfaces!r}")
         if not 1.0 < self.index <= 5.0:
             raise InputError(f"⟨lens.index⟩ of a lamp must be greater than 1 and at most 5, got {self.index!r}")
+        if not all(0 <= s < math.inf for s in (self.base, self.flange)) or (self.flange > 0 and self.base == 0):
+            raise InputError(
+                "⟨lamp.base⟩ and ⟨lamp.flange⟩ must not be negative, and a flange needs the thickness ⟨+lamp.base⟩, got"
+                f" {self.base:g} and {self.flange:g} mm"
+            )
         if not self.chip.reach < self.inner < math.inf:
             raise InputError(
                 f"⟨lamp.inner⟩ must be greater than the radius of the chip, {self.chip.reach:g} mm, got {self.inner:g} mm"

@@ -288,6 +288,10 @@ class LampSettings(Section):
             option=Option("--lamp-surfaces", "1|2"))
     wall: float = setting("least distance between hemisphere and free-form surface", "mm", *LENS, default=1.0, why="injection"
             " moulding of acrylic", option=Option("--lamp-wall", "MM"))
+    base: float = setting("thickness of the foot of the lens, below the plane of the chip", "mm", 0.0, 1e6, default=0.0,
+            why="a base in that plane", written=False, option=Option("--lamp-base", "MM"))
+    flange: float = setting("width of a flange around the foot for holding, beyond the rim of the lens", "mm", 0.0, 1e6,
+            default=0.0, why="none", written=False, option=Option("--lamp-flange", "MM"))
     chip: Pair = setting("full width and height of the chip, 0 for a point", "mm", 0.0, 1e6, default=[0.0, 0.0], why="the limit"
             " that a small chip approaches", option=Option("--chip", "W[xH]"))
     shape: str = setting("shape of the chip: rectangle or disc", choices=("rectangle", "disc"), default="rectangle", written=False,

@@ -1,6 +1,6 @@
 """Lamps: their design, render and export, as those of lenses in `design`, `render` and `export`.
 
-A lamp is a project like others, whose checkpoint holds the control values of log r instead of heights.  It is written when its
+A lamp is a project like others, whose checkpoint holds the control values of r instead of heights.  It is written when its
 design has ended; an interrupted one is begun anew.
 """
 
@@ -22,6 +22,7 @@ from caustic_cli.config.lamp import goal_of, lamp_of
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import MESHES, write_lamp
+from caustic_cli.export.lamp_step import write_lamp_step
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, stages_of, wanted
@@ -44,7 +45,9 @@ retrace = OnDemand("caustic_cli.studies.retrace")
 
 #: Photometric formats: suffix, writer and description.
 PHOTOMETRIC = {"ies": (".ies", write_ies, "IES LM-63-2019, type C"), "ldt": (".ldt", write_ldt, "EULUMDAT")}
-FORMATS = MESHES | PHOTOMETRIC
+#: Solids without samples: suffix, writer and description.
+EXACT = {"step": (".step", write_lamp_step, "the surfaces as NURBS, exact, as a solid")}
+FORMATS = EXACT | MESHES | PHOTOMETRIC
 #: Part of the brightest pixels of an image that are white.
 WHITE = 0.999
 
@@ -53,7 +56,7 @@ WHITE = 0.999
 class LampDesign:
     """A designed lamp.
 
-    project: where it is kept; values: control values of log r over the spline spaces `field`, (n, m) or (2, n, m)
+    project: where it is kept; values: control values of r, mm, over the spline spaces `field`, (n, m) or (2, n, m)
     (`optics.lamp.sides`); picture: irradiance (a, b), or intensity in the far field; figures: of the JSON table.
     """
 
@@ -215,9 +218,10 @@ def check_export(format: str, samples: tuple[int, int] | None) -> None:
     """
     if format not in FORMATS:
         raise InputError(
-            f"⟨format⟩ {format} holds height fields, and a lamp's surface is none; {', '.join(FORMATS)} hold the lamp or its light"
+            f"⟨format⟩ {format} holds height fields, and a lamp's surface is none; {', '.join(FORMATS)} hold the lamp or its light,"
+            " step for programs of optical design as well"
         )
-    if samples is not None and format in PHOTOMETRIC:
+    if samples is not None and format not in MESHES:
         raise InputError(f"⟨samples⟩ belongs to {', '.join(MESHES)}, got {format}")
 
 
@@ -242,6 +246,8 @@ def export(
     lamp, more = LampDesign.of(project), {}
     if format in MESHES:
         write_lamp(path, format, lamp.lamp, lamp.field, lamp.values, samples)
+    elif format in EXACT:
+        EXACT[format][1](path, lamp.lamp, lamp.field, lamp.values)
     else:
         table = intensity_table(lamp.lamp, lamp.field, lamp.values, rays=current_effort().final_rays, seed=project.seed)
         greatest = lamp.field.extent(lamp.values if lamp.lamp.surfaces == 1 else lamp.values[1])[1]

@@ -1,0 +1,187 @@
+"""Files of the solid of a lamp: STEP, meshes and its foot."""
+
+import ast
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import BSpline
+from test_roundtrip import arguments, read_step
+
+from caustic_cli.errors import InputError
+from caustic_cli.export.lamp import flange_radius, lamp_mesh
+from caustic_cli.export.lamp_step import nurbs, write_lamp_step
+from caustic_cli.optics.surfaces.polarfield import PolarField
+from caustic_cli.scene.lamp import Lamp
+
+FIELD = PolarField.uniform((12, 9), (3, 4))
+
+
+def bumpy(radius, seed):
+    """Control values of r of a sphere with bumps."""
+    noise = torch.randn(FIELD.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return FIELD.sphere(radius) * (0.05 * noise).exp()
+
+
+ONE, TWO = bumpy(12.0, 0), torch.stack([bumpy(4.0, 1), bumpy(12.0, 0)])
+#: Lamp, control values, and faces and edges of its solid.
+CASES = {
+    "ring": (Lamp(), ONE, 3, 4),
+    "foot": (Lamp(base=1.5), ONE, 7, 12),
+    "flange": (Lamp(base=1.0, flange=2.0), ONE, 8, 14),
+    "two surfaces": (Lamp(surfaces=2, inner=3.0, base=1.5, flange=2.0), TWO, 8, 14),
+}
+
+
+def random_directions(count):
+    """Coordinates (u, v) of the lit side, (N,) each."""
+    u, v = 2.0 * torch.rand(2, count, dtype=torch.float64, generator=torch.Generator().manual_seed(7)) - 1.0
+    lit = u * u + v * v < 1.0
+    return u[lit], v[lit]
+
+
+def surfaces_in(entities):
+    """The rational surfaces of a file: degrees, homogeneous poles (N, M, 4), knots."""
+    for body in entities.values():
+        if not body.startswith("(BOUNDED_SURFACE"):
+            continue
+        parts = re.fullmatch(
+            r"\(BOUNDED_SURFACE\(\)B_SPLINE_SURFACE(\(.*\))B_SPLINE_SURFACE_WITH_KNOTS(\(.*\))GEOMETRIC_REPRESENTATION_ITEM\(\)"
+            r"RATIONAL_B_SPLINE_SURFACE(\(.*\))REPRESENTATION_ITEM\(''\)SURFACE\(\)\)",
+            body,
+        )
+        (p, q, net, *_), (mu, mv, ku, kv, _) = arguments(parts[1]), arguments(parts[2])
+        weights = ast.literal_eval(parts[3])
+        poles = np.array([[arguments(entities[int(r[1:])])[1] for r in row] for row in net])
+        weights = np.array(weights)[..., None]
+        assert (weights > 0).all()
+        yield (p, q), np.concatenate([poles * weights, weights], -1), (np.repeat(ku, mu), np.repeat(kv, mv))
+
+
+def evaluated(surface, u, v):
+    """Points (N, 3) of a rational surface over [0, 1]^2."""
+    (p, q), net, (ku, kv) = surface
+    bu, bv = BSpline.design_matrix(u, ku, p).toarray(), BSpline.design_matrix(v, kv, q).toarray()
+    found = np.einsum("ai,aj,ijk->ak", bu, bv, net)
+    return found[:, :3] / found[:, 3:]
+
+
+# STEP
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_surfaces_of_a_step_file_are_those_of_the_lamp(case, tmp_path):
+    lamp, values, *_ = CASES[case]
+    write_lamp_step(tmp_path / "a.step", lamp, FIELD, values)
+    outer, inner = surfaces_in(read_step(tmp_path / "a.step"))
+    u, v = random_directions(2000)
+    at = 0.5 * (u.numpy() + 1.0), 0.5 * (v.numpy() + 1.0)
+    wanted = np.stack(FIELD.points(values if values.ndim == 2 else values[1], u, v), 1)
+    assert np.abs(evaluated(outer, *at) - wanted).max() < 1e-12
+    inside = np.stack(FIELD.points(FIELD.sphere(lamp.inner) if values.ndim == 2 else values[0], u, v), 1)
+    assert np.abs(evaluated(inner, *at) - inside).max() < 1e-12
+    moved = np.stack(FIELD.points(1.001 * (values if values.ndim == 2 else values[1]), u, v), 1)
+    assert np.abs(evaluated(outer, *at) - moved).max() > 1e-3
+
+
+def test_the_spline_has_the_degree_and_smoothness_that_its_product_has():
+    spaces, poles, weights = nurbs(FIELD, ONE)
+    assert [s.degree for s in spaces] == [5, 6] and poles.shape == (*(s.n for s in spaces), 3)
+    for own, space in zip(FIELD.spaces, spaces, strict=True):
+        breaks, times = torch.unique(space.knots, return_counts=True)
+        assert breaks.tolist() == own.breaks.tolist() and times[1:-1].tolist() == [3] * (len(breaks) - 2)
+    assert weights.min() > 0.5
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_file_is_a_closed_shell(case, tmp_path):
+    """Every edge is used once each way, the corners of every loop follow one another, and edges end where their curves do."""
+    lamp, values, faces, edges = CASES[case]
+    write_lamp_step(tmp_path / "a.step", lamp, FIELD, values)
+    entities = read_step(tmp_path / "a.step")
+    assert {int(r) for body in entities.values() for r in re.findall(r"#(\d+)", body)} <= set(entities)
+    uses = []
+    for loop in (arguments(b)[1] for b in entities.values() if b.startswith("EDGE_LOOP")):
+        ends = []
+        for oriented in loop:
+            *_, edge, way = arguments(entities[int(oriented[1:])])
+            _, a, b, _, _ = arguments(entities[int(edge[1:])])
+            uses.append((edge, way))
+            ends.append((a, b) if way == "T" else (b, a))
+        assert all(e[1] == n[0] for e, n in zip(ends, ends[1:] + ends[:1], strict=True))
+    assert len(uses) == len(set(uses)) == 2 * edges and len({e for e, _ in uses}) == edges
+    assert sum(b.startswith("ADVANCED_FACE") for b in entities.values()) == faces
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_step_in_opencascade(case, tmp_path):
+    """Only where OpenCASCADE (cadquery-ocp) is installed: a valid solid, its volume, and its points."""
+    control = pytest.importorskip("OCP.STEPControl", exc_type=ImportError)
+    from OCP.BRep import BRep_Tool  # noqa: PLC0415
+    from OCP.BRepCheck import BRepCheck_Analyzer  # noqa: PLC0415
+    from OCP.BRepGProp import BRepGProp  # noqa: PLC0415
+    from OCP.Geom import Geom_BSplineSurface  # noqa: PLC0415
+    from OCP.GProp import GProp_GProps  # noqa: PLC0415
+    from OCP.TopAbs import TopAbs_FACE, TopAbs_ShapeEnum  # noqa: PLC0415
+    from OCP.TopExp import TopExp_Explorer  # noqa: PLC0415
+    from OCP.TopoDS import TopoDS  # noqa: PLC0415
+
+    lamp, values, faces, _ = CASES[case]
+    write_lamp_step(tmp_path / "a.step", lamp, FIELD, values)
+    reader = control.STEPControl_Reader()
+    reader.ReadFile(str(tmp_path / "a.step"))
+    reader.TransferRoots()
+    shape = reader.OneShape()
+    assert BRepCheck_Analyzer(shape).IsValid() and shape.ShapeType() == TopAbs_ShapeEnum.TopAbs_SOLID
+    explorer, surfaces = TopExp_Explorer(shape, TopAbs_FACE), []
+    while explorer.More():
+        face = getattr(TopoDS, "Face_s", None) or TopoDS.Face
+        surfaces.append(BRep_Tool.Surface_s(face(explorer.Current())))
+        explorer.Next()
+    assert len(surfaces) == faces
+    found = GProp_GProps()
+    BRepGProp.VolumePropertiesGK_s(shape, found, 1e-6)
+    assert found.Mass() == pytest.approx(volume(*lamp_mesh(lamp, FIELD, values, (200, 800))), rel=1e-4)
+    outer, inner = [s for s in surfaces if isinstance(s, Geom_BSplineSurface)]
+    u, v = random_directions(300)
+    nets = (values, FIELD.sphere(lamp.inner)) if values.ndim == 2 else (values[1], values[0])
+    for surface, net in zip((outer, inner), nets, strict=True):
+        points = [surface.Value(0.5 * (a + 1.0), 0.5 * (b + 1.0)) for a, b in zip(u.tolist(), v.tolist(), strict=True)]
+        seen = np.array([(p.X(), p.Y(), p.Z()) for p in points])
+        assert np.abs(seen - np.stack(FIELD.points(net, u, v), 1)).max() < 1e-9
+
+
+# Meshes
+
+
+def volume(vertices, faces):
+    """Signed volume of a closed mesh."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    return float((np.cross(a, b) * c).sum() / 6.0)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_meshes_are_closed_and_have_their_foot(case):
+    lamp, values, *_ = CASES[case]
+    vertices, faces = lamp_mesh(lamp, FIELD, values, (60, 240))
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    seen = {tuple(edge) for edge in edges.tolist()}
+    assert len(seen) == len(edges) and all((b, a) in seen for a, b in seen)
+    assert vertices[:, 2].min() == -lamp.base and volume(vertices, faces) > 0
+
+
+def test_a_foot_has_the_volume_of_its_cylinders():
+    bare, foot, flange = Lamp(), Lamp(base=2.0), Lamp(base=2.0, flange=3.0)
+    own, below, around = (volume(*lamp_mesh(lamp, FIELD, FIELD.sphere(10.0), (60, 960))) for lamp in (bare, foot, flange))
+    assert below - own == pytest.approx(2.0 * math.pi * (10.0**2 - 4.0**2), rel=1e-4)
+    assert around - own == pytest.approx(2.0 * math.pi * (13.0**2 - 4.0**2), rel=1e-4)
+    assert flange_radius(flange, FIELD, FIELD.sphere(10.0)) == pytest.approx(13.0)
+
+
+def test_a_flange_without_thickness_is_refused():
+    with pytest.raises(InputError, match="a flange needs the thickness"):
+        Lamp(flange=1.0)
+    with pytest.raises(InputError, match="must not be negative"):
+        Lamp(base=-1.0)
