@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,10 @@ from caustic_cli.io.picture import read_picture
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.project.project import Project
 from caustic_cli.scene.lamp import Lamp
+from caustic_cli.studies import verify
 from caustic_cli.studies.photometry import intensity_table
+from caustic_cli.studies.verify import compare
+from caustic_cli.workflow import lamp as workflow
 from caustic_cli.workflow.lamp import LampDesign
 
 ROAD = ["--lamp", "15", "--throw", "8m", "--picture-size", "30mx10m", "--quiet"]
@@ -221,6 +225,7 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
         (["render", "--screen-at", "100"], "--screen-at is for a lens before its light"),
         (["render", "--source", "disc"], "--source is for a lens before its light"),
         (["render", "--report"], "--report is for a lens before its light"),
+        (["render", "--verify", "mitsuba"], "not installed"),
         (["export"], "a --format is needed"),
         (["export", "-o", "a.dat"], "a --format is needed"),
         (["export", "--format", "heightmap"], "a lamp's surface is none"),
@@ -236,7 +241,8 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
         (["design", "--resume"], "makes a lamp"),
     ],
 )
-def test_what_a_lamp_has_not_is_refused_in_one_line(command, words, road, capfd):
+def test_what_a_lamp_has_not_is_refused_in_one_line(command, words, road, capfd, monkeypatch):
+    monkeypatch.setattr(verify, "find_spec", lambda name: None)
     name, *options = command
     assert words in refused(capfd, name, str(road), *options)
 
@@ -304,6 +310,29 @@ def test_a_foot_is_part_of_the_solid_and_a_step_file_is_repeated(road, capfd):
     assert figures["bytes"] == len(first) and first.count(b"ADVANCED_FACE") == 8
     assert cli.run(["export", str(other), "--format", "step", "--force", "--quiet"]) == 0
     assert Path("foot.step").read_bytes() == first
+
+
+def test_a_scene_for_mitsuba_lies_beside_its_meshes(road, capfd):
+    figures = figures_of(capfd, "export", str(road), "--format", "mitsuba", "--samples", "20x60")
+    assert [Path(file).is_file() for file in (figures["file"], *figures["beside"])] == [True] * 4
+    assert figures["file"] == "road.xml" and "road-outer.ply" in Path("road.xml").read_text()
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_a_comparison_with_mitsuba_decides_the_exit_status(agree, road, capfd, monkeypatch):
+    asked = []
+
+    def found(folder, lamp, goal, field, values, pixels, rays, seed):
+        asked.append(rays)
+        image = np.random.default_rng(1).uniform(1.0, 2.0, (9, *pixels)) / 1e4
+        decision = compare(image[:8], image[8], image[8] / 1e5, rays, 0.0, {"mitsuba": "3", "variant": "none"})
+        return replace(decision, figures=decision.figures | {"agree": agree})
+
+    monkeypatch.setattr(workflow, "verify_lamp", found)
+    monkeypatch.setattr(verify, "find_spec", lambda name: True)
+    status = cli.run(["render", str(road), "--verify", "mitsuba", "--rays", "50000", "-o", "a.png"])
+    assert status == (0 if agree else 1) and asked == [50000] and Path("a-verify.png").is_file()
+    assert ("agree" if agree else "DISAGREE") in capfd.readouterr().out
 
 
 # Photometry

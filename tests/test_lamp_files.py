@@ -1,8 +1,13 @@
-"""Files of the solid of a lamp: STEP, meshes and its foot."""
+"""Files of the solid of a lamp: STEP, meshes, its foot, and its scene for Mitsuba with the comparison."""
 
 import ast
 import math
 import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,10 +16,13 @@ from scipy.interpolate import BSpline
 from test_roundtrip import arguments, read_step
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.lamp import flange_radius, lamp_mesh
+from caustic_cli.export.lamp import flange_radius, lamp_mesh, lamp_parts
+from caustic_cli.export.lamp_mitsuba import companions, plane_of, write_lamp_mitsuba
 from caustic_cli.export.lamp_step import nurbs, write_lamp_step
+from caustic_cli.optics.lamp import ChipRays, land, through
 from caustic_cli.optics.surfaces.polarfield import PolarField
-from caustic_cli.scene.lamp import Lamp
+from caustic_cli.scene.lamp import Chip, Goal, Lamp
+from caustic_cli.studies import lamp_verify
 
 FIELD = PolarField.uniform((12, 9), (3, 4))
 
@@ -185,3 +193,90 @@ def test_a_flange_without_thickness_is_refused():
         Lamp(flange=1.0)
     with pytest.raises(InputError, match="must not be negative"):
         Lamp(base=-1.0)
+
+
+# Mitsuba
+
+
+ROAD = Goal((9000.0, 6000.0), 4000.0)
+
+
+class InItsPlace:
+    """Stands for Mitsuba: traces a lamp of its own by `optics.lamp`, rays from `verify_lamp`."""
+
+    LogLevel, __version__ = SimpleNamespace(Error=0), "none"
+
+    def __init__(self, lamp, goal, values):
+        self.lamp, self.goal, self.values = lamp, goal, values
+
+    def set_log_level(self, level):
+        """Nothing to be silent about."""
+
+    def load_file(self, path, optimize):
+        """The scene, of which the shapes are asked."""
+        assert not optimize
+        self.shapes_in = re.findall(r'id="(\w+)"', Path(path).read_text())
+        return SimpleNamespace(shapes=list)
+
+    def follow(self, _mi, _world, _shapes, surfaces, start, direction):
+        assert {name for name, _ in surfaces} <= set(self.shapes_in)
+        count = start.shape[1]
+        rays = ChipRays(
+            tuple(torch.from_numpy(c) for c in start), tuple(torch.from_numpy(c) for c in direction), torch.ones(count).double()
+        )
+        with torch.no_grad():
+            light = through(self.lamp, FIELD, rays, self.values)
+        x, y, ahead = land(self.goal, light)
+        return x.numpy(), y.numpy(), None, torch.where(ahead, light.power, 0.0 * x).numpy()
+
+
+@pytest.mark.parametrize("chip", [Chip(), Chip("disc", (1.5, 1.0)), Chip("rectangle", (1.0, 2.0))])
+def test_a_lamp_is_compared_and_another_one_differs(chip, tmp_path, monkeypatch):
+    lamp, values = Lamp(chip), FIELD.sphere(12.0) * (0.5 * (bumpy(12.0, 0) / 12.0).log()).exp()
+
+    def found(own, net):
+        other = InItsPlace(own, ROAD, net)
+        monkeypatch.setitem(sys.modules, "mitsuba", other)
+        monkeypatch.setattr(lamp_verify, "follow", other.follow)
+        return lamp_verify.verify_lamp(tmp_path, lamp, ROAD, FIELD, values, (24, 16), 300_000)
+
+    monkeypatch.setattr(lamp_verify, "choose_variant", lambda: "none")
+    monkeypatch.setattr(lamp_verify, "SAMPLES", (5, 20))
+    same = found(lamp, values)
+    assert same.agree and 0.7 < same.figures["z_mean_square"] < 1.3, same.figures
+    assert not found(replace(lamp, index=1.6), values).agree
+    assert not found(lamp, values.flip(0)).agree
+
+
+def test_mitsuba_agrees(tmp_path):
+    """Only where Mitsuba is installed."""
+    pytest.importorskip("mitsuba", exc_type=ImportError)
+    lamp, values = Lamp(Chip("rectangle", (1.0, 2.0)), base=1.0, flange=2.0), bumpy(12.0, 0)
+    for goal in (ROAD, Goal((100.0, 60.0))):
+        found = lamp_verify.verify_lamp(tmp_path, lamp, goal, FIELD, values, (24, 16), 100_000)
+        assert found.agree and 0.8 < found.figures["z_mean_square"] < 1.2, found.figures
+    found = lamp_verify.verify_lamp(tmp_path, Lamp(surfaces=2, inner=3.0), ROAD, FIELD, TWO, (24, 16), 100_000)
+    assert found.agree, found.figures
+
+
+def test_the_far_field_is_seen_on_a_distant_plane():
+    assert plane_of(ROAD, 15.0) is ROAD
+    seen = plane_of(Goal((90.0, 170.0)), 15.0)
+    assert seen.distance == 15000.0 and seen.size == pytest.approx((30000.0, 30000.0 * math.tan(math.radians(70.0))))
+
+
+def test_the_scene_holds_closed_glass_and_a_chip_of_its_light(tmp_path):
+    lamp = Lamp(Chip("disc", (2.0, 1.0)), base=1.0)
+    write_lamp_mitsuba(tmp_path / "a.xml", lamp, ROAD, FIELD, ONE, (30, 20), (20, 60))
+    root = ElementTree.fromstring((tmp_path / "a.xml").read_text())
+    shapes = {shape.get("id"): shape for shape in root.iter("shape")}
+    assert set(shapes) == {"inner", "outer", "foot", "screen", "light"}
+    assert all(path.is_file() for path in companions(tmp_path / "a.xml"))
+    radiance = float(shapes["light"].find("emitter/rgb").get("value"))
+    assert radiance * math.pi * math.pi * 2.0 * 1.0 / 4.0 == pytest.approx(1.0)
+    for (points, faces, normals), name in zip(lamp_parts(lamp, FIELD, ONE, (20, 60)), companions(tmp_path / "a.xml"), strict=True):
+        assert name.read_bytes().count(b"property double nx") == (normals is not None)
+        if normals is not None:  # out of the glass, as the triangles face
+            a, b, c = points[faces].transpose(1, 0, 2)
+            facing = np.cross(b - a, c - a)
+            assert ((facing * normals[faces[:, 0]]).sum(1) > 0.9 * np.linalg.norm(facing, axis=1)).all()

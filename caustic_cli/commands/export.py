@@ -45,8 +45,8 @@ class ExportOptions(options.OfDesign, options.Debugging):
             "--format",
             metavar="NAME[,NAME...]",
             help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items())
-            + "; of a lamp step, stl, ply, obj, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's suffix says;"
-            " lighttools]",
+            + "; of a lamp step, stl, ply, obj, mitsuba, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's"
+            " suffix says; lighttools]",
         ),
     ] = None
     output: Annotated[
@@ -151,15 +151,15 @@ def _export_lamp(asked: ExportOptions, path: Path) -> None:
         InputError: an option is given that does not apply to lamps, or a format does not hold them.
     """
     from caustic_cli.project.project import Project  # noqa: PLC0415
-    from caustic_cli.workflow import lamp  # noqa: PLC0415
+    from caustic_cli.workflow import lamp_export as lamp  # noqa: PLC0415
 
     options.refuse_others(asked, ("format", "output", "samples", "milling"))
     samples = tuple(options.both(options.counts("--samples", asked.samples))) if asked.samples else None
     if asked.format is None:
         suffix = "" if asked.output is None else asked.output.suffix.lower()
-        formats = [name for name, (own, _, _) in lamp.FORMATS.items() if own == suffix]
+        formats = [name for name, own in lamp.FORMATS.items() if own.suffix == suffix]
         if not formats:
-            listed = ", ".join(f"{name} ({own})" for name, (own, _, _) in lamp.FORMATS.items())
+            listed = ", ".join(f"{name} ({own.suffix})" for name, own in lamp.FORMATS.items())
             raise InputError(f"of a lamp a --format is needed, or an --out with its suffix, of {listed}")
     else:
         formats = [name.strip() for name in asked.format.split(",")]
@@ -170,7 +170,8 @@ def _export_lamp(asked: ExportOptions, path: Path) -> None:
     project, found = Project.open(path), []
     for name in formats:
         found.append(lamp.export(project, name, asked.output, samples, asked.force, asked.say))
-        asked.say.result(f"{found[-1]['file']}: {found[-1]['bytes']:,} bytes")
+        for file in (found[-1]["file"], *found[-1].get("beside", ())):
+            asked.say.result(f"{file}: {Path(file).stat().st_size:,} bytes")
     if asked.json:
         console.emit_json(found[0] if len(formats) == 1 else {"exports": found})
 

@@ -7,35 +7,42 @@ innermost ring is a single point on the axis.  Vertices run counter-clockwise se
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export import obj, ply, stl
 from caustic_cli.export.mesh import walls
 from caustic_cli.optics.lamp import sides
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Lamp
 
-#: Format -> suffix, writer of vertices (V, 3) mm and triangles (F, 3), description.
-MESHES = {
-    "stl": (".stl", stl.write_mesh, "closed mesh"),
-    "ply": (".ply", ply.write_mesh, "closed mesh"),
-    "obj": (".obj", obj.write_mesh, "closed mesh"),
-}
 #: Rings and points of a ring, unless given; and most of either.
 SAMPLES, MOST = (150, 600), 4000
 #: Points at which the greatest radius of a rim is looked for.
 AROUND = 3600
 
 
+#: Vertices (V, 3) mm, triangles (F, 3), counter-clockwise seen from outside, and unit normals (V, 3) out of the glass, or None.
+Part = tuple[np.ndarray, np.ndarray, np.ndarray | None]
+
+
 def lamp_mesh(lamp: Lamp, field: PolarField, values: Tensor, samples: tuple[int, int] = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 mm and triangles (F, 3) int64 of the solid.
+    """Vertices (V, 3) float64 mm and triangles (F, 3) int64 of the solid; arguments and errors as in `lamp_parts`."""
+    (inner, cap, _), (outer, top, _), (foot, strips, _) = lamp_parts(lamp, field, values, samples)
+    around, count = samples[1], len(outer)
+    rims = (np.arange(k * count - around, k * count) for k in (1, 2))
+    between = 2 * count + np.arange(len(foot) - 2 * around)
+    number = np.concatenate([next(rims), between, next(rims)])
+    return np.concatenate([outer, inner, foot[around:-around]]), np.concatenate([top, cap + count, number[strips]])
+
+
+def lamp_parts(lamp: Lamp, field: PolarField, values: Tensor, samples: tuple[int, int] = SAMPLES) -> tuple[Part, Part, Part]:
+    """The inner surface, the outer one, and the foot between them, from the loop of the outer rim to that of the inner one.
 
     Args:
         samples: rings, and points of each.
@@ -51,17 +58,15 @@ def lamp_mesh(lamp: Lamp, field: PolarField, values: Tensor, samples: tuple[int,
     u, v = (torch.from_numpy(np.concatenate([[0.0], rho * f(angle)])) for f in (np.cos, np.sin))
     both = surfaces_of(lamp, field, values)
     outer, inner = (np.stack([c.numpy() for c in own.points(net, u, v)], 1) for own, net in both)
+    outward, inward = (np.stack([c.numpy() for c in own.normals(net, u, v)], 1) for own, net in both)
     for points in (outer, inner):
         points[-around:, 2] = 0.0  # the rim lies in the base plane, but for rounding
-    cap, count = _disc(rings, around), len(outer)
-    vertices, faces = [outer, inner], [cap, cap[:, ::-1] + count]
-    loop, end, total = np.arange(count - around, count), np.arange(2 * count - around, 2 * count), 2 * count
-    for points in _foot(lamp, outer[-around:], inner[-around:], flange_radius(lamp, *both[0]), angle[:around]):
-        following = np.arange(total, total + around)
-        vertices.append(points)
-        faces.append(walls(loop, following))
-        loop, total = following, total + around
-    return np.concatenate(vertices), np.concatenate([*faces, walls(loop, end)])
+    cap = _disc(rings, around)
+    between = _foot(lamp, outer[-around:], inner[-around:], flange_radius(lamp, *both[0]), angle[:around])
+    loops = [outer[-around:], *between, inner[-around:]]
+    number = np.arange(len(loops) * around).reshape(len(loops), around)
+    foot = np.concatenate([walls(one, other) for one, other in itertools.pairwise(number)])
+    return (inner, cap[:, ::-1], -inward), (outer, cap, outward), (np.concatenate(loops), foot, None)
 
 
 def surfaces_of(lamp: Lamp, field: PolarField, values: Tensor) -> tuple[tuple[PolarField, Tensor], tuple[PolarField, Tensor]]:
@@ -104,8 +109,3 @@ def _disc(rings: int, around: int) -> np.ndarray:
         low, high = 1 + (ring - 1) * around, 1 + ring * around
         parts += [np.stack([low + k, high + k, high + ahead], 1), np.stack([low + k, high + ahead, low + ahead], 1)]
     return np.concatenate(parts)
-
-
-def write_lamp(path: Path, format: str, lamp: Lamp, field: PolarField, values: Tensor, samples: tuple[int, int] | None) -> None:
-    """Write the solid in one of the formats of MESHES, atomically."""
-    MESHES[format][1](path, *lamp_mesh(lamp, field, values, samples or SAMPLES))

@@ -1,4 +1,4 @@
-"""Lamps: their design, render and export, as those of lenses in `design`, `render` and `export`.
+"""Lamps: their design and render, as those of lenses in `design` and `render`; their export is `lamp_export`.
 
 A lamp is a project like others, whose checkpoint holds the control values of r instead of heights.  It is written when its
 design has ended; an interrupted one is begun anew.
@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,13 +22,11 @@ from caustic_cli import __version__
 from caustic_cli.config.lamp import goal_of, lamp_of
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
-from caustic_cli.export.lamp import MESHES, write_lamp
-from caustic_cli.export.lamp_step import write_lamp_step
+from caustic_cli.export.lamp_mitsuba import plane_of
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, stages_of, wanted
 from caustic_cli.io.files import Piped
-from caustic_cli.io.photometry import Photometry, write_ies, write_ldt
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.surfaces.polarfield import PolarField
@@ -37,17 +36,16 @@ from caustic_cli.project.new import new_project
 from caustic_cli.project.project import RENDER, Project
 from caustic_cli.scene.lamp import Goal, Lamp
 from caustic_cli.studies.lamp import lamp_figures
-from caustic_cli.studies.photometry import FLUX, intensity_table
+from caustic_cli.studies.lamp_verify import verify_lamp
+from caustic_cli.studies.photometry import intensity_table
 from caustic_cli.studies.tolerances import one_thread
+from caustic_cli.studies.verify import write_panels
 from caustic_cli.workflow.reporter import Reporter
 
 retrace = OnDemand("caustic_cli.studies.retrace")
 
-#: Photometric formats: suffix, writer and description.
-PHOTOMETRIC = {"ies": (".ies", write_ies, "IES LM-63-2019, type C"), "ldt": (".ldt", write_ldt, "EULUMDAT")}
-#: Solids without samples: suffix, writer and description.
-EXACT = {"step": (".step", write_lamp_step, "the surfaces as NURBS, exact, as a solid")}
-FORMATS = EXACT | MESHES | PHOTOMETRIC
+#: Pixels of a comparison with Mitsuba, and its rays unless given.
+VERIFIED, BESIDE_RAYS = 2400, 1_000_000
 #: Part of the brightest pixels of an image that are white.
 WHITE = 0.999
 
@@ -86,6 +84,12 @@ class LampDesign:
             raise project.error(f"{error}") from error
         return cls(project, lamp, goal, field, values, picture_of(project), dict(saved.results))
 
+    @property
+    def name(self) -> str:
+        """Its name in files: that of its project."""
+        assert self.project.path is not None
+        return self.project.path.resolve().stem
+
     def image_and_figures(self, rays: int | None, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
         """Part of the light on each pixel, (n_x, n_y), and the figures of `studies.lamp`, with those of the far field; rays: None
         for those of the evaluation of a design."""
@@ -103,6 +107,18 @@ class LampDesign:
             table = intensity_table(self.lamp, self.field, self.values, rays=rays, seed=seed)
             figures |= {"peak_candela": table.peak, "beam_angles": [table.full_angle(0.5, k) for k in (0, len(table.planes) // 4)]}
         return found.image, figures
+
+    def verified(self, panels: Path, rays: int, seed: int) -> dict[str, Any]:
+        """The figures of a comparison with Mitsuba, and its image, which is written.
+
+        Raises:
+            CausticError: see `studies.lamp_verify`.
+        """
+        pixels, seen = pixels_of(self.goal, VERIFIED), plane_of(self.goal, self.lamp.radius)
+        with TemporaryDirectory() as folder:
+            found = verify_lamp(Path(folder), self.lamp, self.goal, self.field, self.values, pixels, rays, seed)
+        write_panels(panels, found, (0.5 * seen.size[0], 0.5 * seen.size[1]))
+        return found.figures | {"image": str(panels)}
 
 
 def picture_of(project: Project) -> np.ndarray:
@@ -187,16 +203,26 @@ def _write_image(path: Path, image: np.ndarray, project: Project, goal: Goal, wi
 
 
 def render(
-    project: Project, rays: int | None, seed: int | None, image: Path | None, npy: Path | None, force: bool, say: Reporter
+    project: Project,
+    rays: int | None,
+    seed: int | None,
+    image: Path | None,
+    npy: Path | None,
+    force: bool,
+    say: Reporter,
+    mitsuba: bool = False,
 ) -> dict[str, Any]:
     """Trace a lamp with independent rays, write its image, and return its figures; arguments as of caustic render.
+
+    mitsuba: compare with Mitsuba as well, and write the panels beside the image.
 
     Raises:
         InputError: there is no lamp, or a file exists already; nothing was written.
     """
     began, path = time.monotonic(), image or project.image
-    made = uptodate.Outputs(project, "render", {"rays": rays, "seed": seed}, [path, npy])
-    if not force and (figures := made.found()):
+    panels = path.with_name("verify.png" if image is None else f"{path.stem}-verify.png") if mitsuba else None
+    made = uptodate.Outputs(project, "render", {"rays": rays, "seed": seed}, [path, npy, panels])
+    if not (force or mitsuba) and (figures := made.found()):
         say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
         return figures
     made.refuse_foreign(force)
@@ -206,55 +232,9 @@ def render(
     if npy is not None:
         write_npy(npy, seen)
     figures |= {"iterations": lamp.figures.get("iterations"), "seconds": time.monotonic() - began, "image": str(path)}
-    made.keep(figures)
-    return figures
-
-
-def check_export(format: str, samples: tuple[int, int] | None) -> None:
-    """Refuse a format that no lamp has, or samples of one that has none.
-
-    Raises:
-        InputError: as it says.
-    """
-    if format not in FORMATS:
-        raise InputError(
-            f"⟨format⟩ {format} holds height fields, and a lamp's surface is none; {', '.join(FORMATS)} hold the lamp or its light,"
-            " step for programs of optical design as well"
-        )
-    if samples is not None and format not in MESHES:
-        raise InputError(f"⟨samples⟩ belongs to {', '.join(MESHES)}, got {format}")
-
-
-def export(
-    project: Project, format: str, output: Path | None, samples: tuple[int, int] | None, force: bool, say: Reporter
-) -> dict[str, Any]:
-    """Write a lamp in one of FORMATS; returns file, format, bytes and seconds, and for a photometric file of its light flux, lm per
-    1000 lm of the chip, and peak_candela.
-
-    Raises:
-        InputError: there is no lamp, the format is not one of a lamp, or a file exists already; nothing was written.
-    """
-    began = time.monotonic()
-    check_export(format, samples)
-    assert project.path is not None
-    path = output or Path(project.path.resolve().stem + FORMATS[format][0])
-    made = uptodate.Outputs(project, "export", {"format": format, "samples": samples}, [path])
-    if not force and (found := made.found()):
-        say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
-        return found
-    made.refuse_foreign(force)
-    lamp, more = LampDesign.of(project), {}
-    if format in MESHES:
-        write_lamp(path, format, lamp.lamp, lamp.field, lamp.values, samples)
-    elif format in EXACT:
-        EXACT[format][1](path, lamp.lamp, lamp.field, lamp.values)
-    else:
-        table = intensity_table(lamp.lamp, lamp.field, lamp.values, rays=current_effort().final_rays, seed=project.seed)
-        greatest = lamp.field.extent(lamp.values if lamp.lamp.surfaces == 1 else lamp.values[1])[1]
-        name = project.path.resolve().stem
-        PHOTOMETRIC[format][1](path, Photometry(table.planes, table.angles, table.values, FLUX, name, 2.0 * greatest, greatest))
-        more = {"flux": table.flux, "peak_candela": table.peak}
-    figures = {"file": str(path), "format": format, "bytes": path.stat().st_size, **more, "seconds": time.monotonic() - began}
+    if panels is not None:
+        figures["verify"] = lamp.verified(panels, rays or BESIDE_RAYS, project.seed if seed is None else seed)
+        return figures
     made.keep(figures)
     return figures
 
