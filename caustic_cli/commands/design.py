@@ -34,7 +34,7 @@ class DesignOptions(options.Computation):
         typer.Argument(
             metavar="TARGET",
             help="The picture: an image file or a 2-D .npy of irradiance, - for standard input, or uniform or disc where there is"
-            " no such file; with --resume, the project.",
+            " no such file; of a lamp also the light of a photometric file, .ies or .ldt; with --resume, the project.",
             show_default=False,
         ),
     ]
@@ -208,6 +208,7 @@ def _check_new(asked: DesignOptions) -> Any:
     from caustic_cli.config.settings import by_section, implied, refuse_unused  # noqa: PLC0415
     from caustic_cli.config.values import refuse_bad_file, refuse_bad_options  # noqa: PLC0415
     from caustic_cli.io.files import read_stdin  # noqa: PLC0415
+    from caustic_cli.io.photometry import SUFFIXES, read_photometry  # noqa: PLC0415
     from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, read_picture  # noqa: PLC0415
 
     given, target = asked.given, asked.target
@@ -221,7 +222,9 @@ def _check_new(asked: DesignOptions) -> Any:
     if asked.config is None and asked.preset is None:
         refuse_unused({"type": default("source.type")} | implied(by_section(given)).get("source", {}), given)
     picture = read_stdin(ACCEPTED, MAX_BYTES) if str(target) == "-" else target
-    if asked.config is None:  # a configuration may set its encoding
+    if target.suffix.lower() in SUFFIXES:
+        read_photometry(target)
+    elif asked.config is None:  # a configuration may set its encoding
         read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
     return picture
 

@@ -240,8 +240,9 @@ class SourceSettings(Section):
             option=Option("--source-tilt", "A,B", BOTH))
     direction: Point | None = setting("that direction as a vector [x, y, z] of any length, z > 0, instead of tilt, as which a"
             " project keeps it")
-    intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of"
-            " degrees from +z and relative intensity", default="uniform", why="an isotropic source, the simplest",
+    intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, a .csv of"
+            " degrees from +z and relative intensity, or a photometric file (.ies, .ldt) symmetric about its axis",
+            default="uniform", why="an isotropic source, the simplest",
             option=Option("--intensity", "uniform|lambertian|FILE", BOTH), file="intensity")
     aim: bool = setting("sample rays over the lens instead of the whole cone", default=True, why="no rays that miss the lens")
     polarisation: float | None = setting("direction of linear polarisation from +x", "degrees", -360.0, 360.0,

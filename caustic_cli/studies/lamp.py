@@ -1,8 +1,8 @@
 """Evaluation of a lamp by independent rays: where all light of the chip goes, and how well it fits the target.
 
-All figures are fractions of the light that the chip emits.  Errors are corrected for the noise of the rays: with images A and B of
-two independent halves, divided by the target and by their means, the mean of (A - 1) (B - 1) is the squared error without bias
-(compare `studies.noise`).
+All figures are fractions of the light that the chip emits.  Errors are corrected for the noise of the rays: with densities A and B
+of two independent halves and T of the target, each divided by its mean, the mean of (A - T) (B - T) is the squared error without
+bias (compare `studies.noise`).
 """
 
 from __future__ import annotations
@@ -84,16 +84,18 @@ def lamp_image(
 
 
 def relative_rms(
-    halves: tuple[np.ndarray, np.ndarray], target: np.ndarray, where: np.ndarray
+    halves: tuple[np.ndarray, np.ndarray], target: np.ndarray, where: np.ndarray, shares: np.ndarray
 ) -> tuple[float, float] | tuple[None, None]:
-    """Root mean square of the relative deviation of an image from its target over some pixels, corrected for noise, and its
-    standard error, by the difference of the halves; None for no pixels.
+    """Root mean square of the deviation of the illuminance, or intensity, from that of the target over some pixels, each divided by
+    its mean, corrected for noise, and its standard error, by the difference of the halves; None for no pixels.
 
-    The standard deviation of the illuminance over its mean where the target is uniform."""
+    The standard deviation of the illuminance over its mean where the target is uniform.  shares: of the pixels, see `Goal.shares`.
+    """
     if not where.any() or not all(half[where].sum() > 0 for half in halves):
         return None, None
-    one, other = (half[where] / target[where] for half in halves)
-    a, b = one / one.mean() - 1.0, other / other.mean() - 1.0
+    one, other, wanted = (part[where] / shares[where] for part in (*halves, target))
+    wanted = wanted / wanted.mean()
+    a, b = one / one.mean() - wanted, other / other.mean() - wanted
     square, noise = max(0.0, float((a * b).mean())), 0.5 * float(np.mean((a - b) ** 2))  # noise: of a and of b, squared
     error = math.sqrt((noise * noise + 2.0 * square * noise) / a.size)  # of the square, to first order in independent pixels
     return math.sqrt(square), min(math.sqrt(error), 0.5 * error / math.sqrt(square)) if square > 0 else math.sqrt(error)
@@ -125,8 +127,9 @@ def lamp_figures(
     """
     pixels, fewer = ((t.shape[0], t.shape[1]) for t in (target, coarse))
     found = lamp_image(lamp, goal, field, values, pixels, fewer, rays, seed)
-    whole = relative_rms(found.halves, target, _compared(target, goal, shaded, 0.0))
-    interior = relative_rms(found.halves, target, _compared(target, goal, shaded, BORDER))
+    shares = goal.shares(pixels)
+    whole = relative_rms(found.halves, target, _compared(target, goal, shaded, 0.0), shares)
+    interior = relative_rms(found.halves, target, _compared(target, goal, shaded, BORDER), shares)
     uniformity = None if shaded else _least_over_mean(found.coarse, coarse, _compared(coarse, goal, False, BORDER))
     return found, {
         "of_source": float(found.image.sum()),
