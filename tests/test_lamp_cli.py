@@ -17,8 +17,9 @@ from caustic_cli.io.photometry import Photometry, read_photometry, write_ies, wr
 from caustic_cli.io.picture import read_picture
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.project.project import Project
-from caustic_cli.scene.lamp import Lamp
+from caustic_cli.scene.lamp import Goal, Lamp
 from caustic_cli.studies import verify
+from caustic_cli.studies.lamp_report import density
 from caustic_cli.studies.photometry import intensity_table
 from caustic_cli.studies.verify import compare
 from caustic_cli.workflow import lamp as workflow
@@ -224,7 +225,7 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
         (["render", "--effects", "none"], "--effects is for a lens before its light"),
         (["render", "--screen-at", "100"], "--screen-at is for a lens before its light"),
         (["render", "--source", "disc"], "--source is for a lens before its light"),
-        (["render", "--report"], "--report is for a lens before its light"),
+        (["render", "--explain"], "--explain is for a lens before its light"),
         (["render", "--verify", "mitsuba"], "not installed"),
         (["export"], "a --format is needed"),
         (["export", "-o", "a.dat"], "a --format is needed"),
@@ -333,6 +334,32 @@ def test_a_comparison_with_mitsuba_decides_the_exit_status(agree, road, capfd, m
     status = cli.run(["render", str(road), "--verify", "mitsuba", "--rays", "50000", "-o", "a.png"])
     assert status == (0 if agree else 1) and asked == [50000] and Path("a-verify.png").is_file()
     assert ("agree" if agree else "DISAGREE") in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("goal", [Goal((3000.0, 1000.0), 2000.0), Goal((120.0, 40.0))])
+def test_the_illuminance_of_a_report_is_flux_over_area_or_solid_angle(goal):
+    """Of all of 1000 lm: lux times square metres, or candela times steradians."""
+    image = np.random.default_rng(2).uniform(size=(60, 20))
+    image *= 0.8 / image.sum()
+    area = 3.0 if not goal.far else math.radians(120.0) * 2.0 * math.sin(math.radians(20.0))
+    assert float((density(goal, image) * goal.shares((60, 20)) * area).sum()) == pytest.approx(800.0)
+
+
+def size_of(path):
+    """Width and height of an image."""
+    with Image.open(path) as image:
+        return image.size
+
+
+def test_a_report_is_drawn_by_design_and_render(road, capfd, monkeypatch):
+    figures = figures_of(capfd, "render", str(road), "--rays", "20000", "--report", "-o", "a.png")
+    assert size_of("a-report.png") == (1500, 800)
+    assert figures["peak_candela"] > 500.0 and len(figures["beam_angles"]) == len(figures["field_angles"]) == 2
+    assert all(field > beam > 30.0 for beam, field in zip(figures["beam_angles"], figures["field_angles"], strict=True))
+    assert figures["beam_angles"][0] > figures["beam_angles"][1]  # the road is long along x
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True lamp_stages=((300,5000,2,0.1),(300,5000,2,0.1))")
+    assert cli.run(["design", "uniform", "--lamp", "15", "--angles", "120x60", "-o", "far", "--quiet"]) == 0
+    assert size_of("far/report.png") == (1500, 800)
 
 
 # Photometry

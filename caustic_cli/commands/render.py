@@ -114,7 +114,7 @@ class OutputOptions(options.Given):
             "--report",
             help="Also report the manufacturing data of the lens: wall, stock, slopes, concave"
             " radius, margin to internal reflection, sharpness, tolerances; writes report.json"
-            " beside the image.",
+            " beside the image.  Of a lamp, isolux lines, polar diagram, sections and losses: report.png.",
         ),
     ] = False
     tool_radius: Annotated[
@@ -220,7 +220,7 @@ def _refuse_disagreement(asked: RenderOptions, figures: dict[str, Any]) -> None:
 
 
 #: Options that apply to lamps.
-OF_LAMPS = ("rays", "output", "npy", "verify")
+OF_LAMPS = ("rays", "output", "npy", "verify", "report")
 
 
 def _render_lamp(asked: RenderOptions, rays: int | None) -> None:
@@ -236,7 +236,7 @@ def _render_lamp(asked: RenderOptions, rays: int | None) -> None:
     options.refuse_others(asked, OF_LAMPS)
     if asked.verify and (why := verify.not_installed()):
         raise InputError(why)
-    where = (asked.output, asked.npy, asked.force, asked.say, asked.verify is not None)
+    where = (asked.output, asked.npy, asked.force, asked.say, asked.verify is not None, asked.report)
     figures = lamp.render(Project.open(asked.project), rays, asked.seed, *where)
     asked.say.table(str(asked.project), lamp.rows(figures))
     if asked.verify:

@@ -8,7 +8,7 @@ bias (compare `studies.noise`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,12 +64,14 @@ def lamp_image(
     coarse: tuple[int, int] = (2, 2),
     rays: int = RAYS,
     seed: int = 0,
+    also: Callable[[LampLight], None] = lambda light: None,
 ) -> LampImage:
-    """Trace a lamp with about `rays` independent rays, each counted on the pixel where it lands."""
+    """Trace a lamp with about `rays` independent rays, each counted on the pixel where it lands; also: takes their light, too."""
     screens, splat = [Screen(goal.size, resolution=n) for n in (pixels, coarse)], backend_for("cpu").splat
     halves, fewer = torch.zeros(2, *pixels, dtype=torch.float64), torch.zeros(coarse, dtype=torch.float64)
     lost, count = dict.fromkeys((*LOSSES, "elsewhere"), 0.0), 0
     for half, light in traced(lamp, field, values, rays, seed):
+        also(light)
         x, y, ahead = land(goal, light)
         arriving = torch.where(ahead, light.power, torch.zeros_like(light.power))
         image, outside = splat(x, y, arriving, screens[0], Filter())
@@ -112,10 +114,12 @@ def lamp_figures(
     shaded: bool = False,
     rays: int = RAYS,
     seed: int = 0,
+    also: Callable[[LampLight], None] = lambda light: None,
 ) -> tuple[LampImage, dict[str, Any]]:
     """Figures of a lamp by independent rays.
 
     Args:
+        also: as of `lamp_image`.
         target: (n_x, n_y) part of the light wanted on each pixel; coarse: the same on fewer pixels, for the uniformity.
         shaded: whether the picture has more shades than lit and dark: otherwise only pixels that are lit entirely are compared.
 
@@ -126,7 +130,7 @@ def lamp_figures(
         least_wall and greatest_radius, mm; pixels; rays.
     """
     pixels, fewer = ((t.shape[0], t.shape[1]) for t in (target, coarse))
-    found = lamp_image(lamp, goal, field, values, pixels, fewer, rays, seed)
+    found = lamp_image(lamp, goal, field, values, pixels, fewer, rays, seed, also)
     shares = goal.shares(pixels)
     whole = relative_rms(found.halves, target, _compared(target, goal, shaded, 0.0), shares)
     interior = relative_rms(found.halves, target, _compared(target, goal, shaded, BORDER), shares)

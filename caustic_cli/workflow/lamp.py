@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,21 +33,31 @@ from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.project import directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.new import new_project
-from caustic_cli.project.project import RENDER, Project
+from caustic_cli.project.project import RENDER, REPORT, Project
 from caustic_cli.scene.lamp import Goal, Lamp
 from caustic_cli.studies.lamp import lamp_figures
 from caustic_cli.studies.lamp_verify import verify_lamp
-from caustic_cli.studies.photometry import intensity_table
+from caustic_cli.studies.photometry import IntensitySum, IntensityTable
 from caustic_cli.studies.tolerances import one_thread
 from caustic_cli.studies.verify import write_panels
 from caustic_cli.workflow.reporter import Reporter
 
-retrace = OnDemand("caustic_cli.studies.retrace")
+lamp_report = OnDemand("caustic_cli.studies.lamp_report")
 
 #: Pixels of a comparison with Mitsuba, and its rays unless given.
 VERIFIED, BESIDE_RAYS = 2400, 1_000_000
 #: Part of the brightest pixels of an image that are white.
 WHITE = 0.999
+
+
+class Evaluation(NamedTuple):
+    """image, wanted: part of the light on each pixel, (n_x, n_y), and as it should be; table: of intensities; figures: of
+    `studies.lamp` and of the table."""
+
+    image: np.ndarray
+    wanted: np.ndarray
+    table: IntensityTable
+    figures: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -90,9 +100,8 @@ class LampDesign:
         assert self.project.path is not None
         return self.project.path.resolve().stem
 
-    def image_and_figures(self, rays: int | None, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
-        """Part of the light on each pixel, (n_x, n_y), and the figures of `studies.lamp`, with those of the far field; rays: None
-        for those of the evaluation of a design."""
+    def evaluated(self, rays: int | None, seed: int) -> Evaluation:
+        """The light by independent rays; rays: None for those of the evaluation of a design."""
         effort = current_effort()
         rays = rays or effort.final_rays
         stages = effort.lamp_stages
@@ -100,13 +109,16 @@ class LampDesign:
             wanted(self.goal, self.picture, pixels_of(self.goal, count)).numpy() for count in (4 * stages[-1][0], stages[1][0])
         )
         shaded = len(np.unique(self.picture[self.picture > 0])) > 1
-        found, figures = lamp_figures(
-            self.lamp, self.goal, self.field, self.values, fine, coarse, shaded=shaded, rays=rays, seed=seed
-        )
-        if self.goal.far:
-            table = intensity_table(self.lamp, self.field, self.values, rays=rays, seed=seed)
-            figures |= {"peak_candela": table.peak, "beam_angles": [table.full_angle(0.5, k) for k in (0, len(table.planes) // 4)]}
-        return found.image, figures
+        intensities = IntensitySum()
+        how: dict[str, Any] = {"shaded": shaded, "rays": rays, "seed": seed, "also": intensities.add}
+        found, figures = lamp_figures(self.lamp, self.goal, self.field, self.values, fine, coarse, **how)
+        table = intensities.table()
+        return Evaluation(found.image, fine, table, figures | table.figures)
+
+    def write_report(self, path: Path, found: Evaluation) -> None:
+        """Write the report of an evaluation."""
+        of = (self.lamp, self.goal, self.field, self.values)
+        lamp_report.write_lamp_report(path, *of, found.image, found.wanted, found.table, found.figures)
 
     def verified(self, panels: Path, rays: int, seed: int) -> dict[str, Any]:
         """The figures of a comparison with Mitsuba, and its image, which is written.
@@ -168,8 +180,8 @@ def design(
         with one_thread():  # the tensors of a chunk of rays are too small for more
             values = design_lamp(lamp, goal, picture, effort=effort, seed=s.design.seed, on_iteration=told)
     found = LampDesign(project, lamp, goal, field_of(effort), values, picture, {})
-    image, figures = found.image_and_figures(None, s.design.seed)
-    figures |= {"iterations": len(history), "seconds": began.seconds, "reason": "iterations"}
+    evaluation = found.evaluated(None, s.design.seed)
+    figures = evaluation.figures | {"iterations": len(history), "seconds": began.seconds, "reason": "iterations"}
     if out is not None:
         figures |= {"image": str(out / RENDER), "project": str(out)}
         state = State(
@@ -178,7 +190,9 @@ def design(
         made = {"caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "seed": s.design.seed}
         with project.hold:
             directory.create(project, force, Checkpoint(state, found.field.spaces, made, figures, uptodate.inputs(project)))
-            _write_image(out / RENDER, image, project, goal)
+            _write_image(out / RENDER, evaluation.image, project, goal)
+            if effort.report:
+                found.write_report(out / REPORT, evaluation)
     return replace(found, figures=figures)
 
 
@@ -211,27 +225,33 @@ def render(
     force: bool,
     say: Reporter,
     mitsuba: bool = False,
+    report: bool = False,
 ) -> dict[str, Any]:
     """Trace a lamp with independent rays, write its image, and return its figures; arguments as of caustic render.
 
-    mitsuba: compare with Mitsuba as well, and write the panels beside the image.
+    mitsuba: compare with Mitsuba as well, and write the panels beside the image; report: write the report there.
 
     Raises:
         InputError: there is no lamp, or a file exists already; nothing was written.
     """
     began, path = time.monotonic(), image or project.image
-    panels = path.with_name("verify.png" if image is None else f"{path.stem}-verify.png") if mitsuba else None
-    made = uptodate.Outputs(project, "render", {"rays": rays, "seed": seed}, [path, npy, panels])
+    panels, plots = (
+        path.with_name(name if image is None else f"{path.stem}-{name}") if asked else None
+        for name, asked in (("verify.png", mitsuba), (REPORT, report))
+    )
+    made = uptodate.Outputs(project, "render", {"rays": rays, "seed": seed, "report": report}, [path, npy, panels, plots])
     if not (force or mitsuba) and (figures := made.found()):
         say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
         return figures
     made.refuse_foreign(force)
     lamp = LampDesign.of(project)
-    seen, figures = lamp.image_and_figures(rays, project.seed if seed is None else seed)
-    _write_image(path, seen, project, lamp.goal, WIDE if image is None else 1)
+    seen = lamp.evaluated(rays, project.seed if seed is None else seed)
+    _write_image(path, seen.image, project, lamp.goal, WIDE if image is None else 1)
     if npy is not None:
-        write_npy(npy, seen)
-    figures |= {"iterations": lamp.figures.get("iterations"), "seconds": time.monotonic() - began, "image": str(path)}
+        write_npy(npy, seen.image)
+    if plots is not None:
+        lamp.write_report(plots, seen)
+    figures = seen.figures | {"iterations": lamp.figures.get("iterations"), "seconds": time.monotonic() - began, "image": str(path)}
     if panels is not None:
         figures["verify"] = lamp.verified(panels, rays or BESIDE_RAYS, project.seed if seed is None else seed)
         return figures
@@ -258,9 +278,10 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("least over mean", number("uniformity", ".3f")),
         ("lost", ", ".join(f"{name} {part:.2%}" for name, part in lost.items()) or "nothing"),
     ]
-    if "peak_candela" in figures:
-        angles = " x ".join(f"{angle:.0f}" for angle in figures["beam_angles"])
-        found.append(("peak", f"{figures['peak_candela']:.0f} cd per 1000 lm of the chip; half of it at {angles} degrees"))
+    beam, field = (" x ".join(f"{angle:.0f}" for angle in figures[f"{name}_angles"]) for name in ("beam", "field"))
+    found.append(
+        ("intensity", f"{figures['peak_candela']:.0f} cd per 1000 lm of the chip; beam angle {beam} degrees, field angle {field}")
+    )
     found += [
         ("least wall", f"{figures['least_wall']:.3g} mm; greatest radius {figures['greatest_radius']:.4g} mm"),
         ("rays", f"{figures['rays']:,} on {width} x {height} pixels"),
