@@ -10,9 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
+import caustic_cli
 from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import lamp_mesh
+from caustic_cli.inverse import lamp as inverse
 from caustic_cli.io.photometry import Photometry, read_photometry, write_ies, write_ldt
 from caustic_cli.io.picture import read_picture
 from caustic_cli.optics.surfaces.polarfield import PolarField
@@ -180,6 +182,59 @@ def test_a_project_edited_beyond_its_lens_is_refused(road, capfd):
     assert not Path("x.png").exists()
 
 
+def test_an_interrupted_design_goes_on_after_its_last_complete_stage(road, capfd, monkeypatch):
+    stages = []
+    refine = inverse.refine
+
+    def interrupted(objective, values, iterations, on_iteration):
+        stages.append(len(stages))
+        if len(stages) == 2:
+            raise KeyboardInterrupt
+        return refine(objective, values, iterations, on_iteration)
+
+    monkeypatch.setattr(inverse, "refine", interrupted)
+    assert cli.run(["design", "uniform", *ROAD, "-o", "half"]) == 130
+    capfd.readouterr()
+    assert Project.open("half").load().state.stage == 1 and not Path("half/render.png").exists()
+    figures = figures_of(capfd, "design", "--resume", "half")
+    assert len(stages) == 3 and Path("half/render.png").is_file()
+    one, other = (Project.open(path).load() for path in ("half", road))
+    assert torch.equal(one.state.heights, other.state.heights)
+    assert figures["iterations"] == len(one.state.history) == other.results["iterations"]
+    again = figures_of(capfd, "design", "--resume", "half")
+    assert len(stages) == 3 and again["of_source"] == figures["of_source"]
+
+
+def test_the_same_command_goes_on_with_an_interrupted_design(capfd, monkeypatch):
+    def interrupted(*_arguments, **_more):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as other:
+        other.setattr(LampDesign, "evaluated", interrupted)
+        assert cli.run(["design", "uniform", *ROAD, "-o", "half"]) == 130
+    capfd.readouterr()
+    with monkeypatch.context() as other:
+        other.setattr(inverse, "refine", interrupted)  # all stages are done
+        assert figures_of(capfd, "design", "uniform", *ROAD, "-o", "half")["of_source"] > 0.8
+
+
+def test_lamps_are_designed_rendered_and_exported_from_python(road):
+    lamp = caustic_cli.design("uniform", lamp=15, throw=8000, picture_size=[30000, 10000])
+    assert isinstance(lamp, LampDesign) and torch.equal(lamp.values, caustic_cli.load(road).values)
+    image, figures = caustic_cli.render(lamp, 20_000, seed=3)
+    assert image.sum() == pytest.approx(figures["of_source"]) == pytest.approx(0.84, abs=0.03)
+    assert caustic_cli.render(road, 20_000, seed=3).figures["of_source"] == figures["of_source"]
+    assert lamp.export("a.step").read_text().startswith("ISO-10303-21") and lamp.export("b.obj", samples=(9, 20)).is_file()
+    for what, words in (
+        (lambda: lamp.export("a.dat"), "format is needed"),
+        (lambda: caustic_cli.load(road, source="disc"), "has no other light or screen"),
+        (lambda: caustic_cli.design("uniform", lamp=15, device="cuda", angles=[60, 60]), "on the CPU"),
+        (lambda: caustic_cli.design("uniform", lamp=15, movie="a.gif", angles=[60, 60]), "is for a lens before its light"),
+    ):
+        with pytest.raises(InputError, match=words):
+            what()
+
+
 # Refusals
 
 
@@ -239,7 +294,8 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
         (["export", "--format", "stl,ply", "-o", "a.stl"], "--out names one file"),
         (["gradmap", "--control", "3,3"], "makes a lamp"),
         (["convergence"], "makes a lamp"),
-        (["design", "--resume"], "makes a lamp"),
+        (["design", "--resume", "--iterations", "9"], "--iterations is for a lens before its light"),
+        (["design", "--resume", "--movie", "a.gif"], "--movie is for a lens before its light"),
     ],
 )
 def test_what_a_lamp_has_not_is_refused_in_one_line(command, words, road, capfd, monkeypatch):
@@ -323,8 +379,9 @@ def test_a_scene_for_mitsuba_lies_beside_its_meshes(road, capfd):
 def test_a_comparison_with_mitsuba_decides_the_exit_status(agree, road, capfd, monkeypatch):
     asked = []
 
-    def found(folder, lamp, goal, field, values, pixels, rays, seed):
+    def found(scene, lamp, goal, field, values, pixels, rays, seed):
         asked.append(rays)
+        assert scene.is_file()
         image = np.random.default_rng(1).uniform(1.0, 2.0, (9, *pixels)) / 1e4
         decision = compare(image[:8], image[8], image[8] / 1e5, rays, 0.0, {"mitsuba": "3", "variant": "none"})
         return replace(decision, figures=decision.figures | {"agree": agree})
@@ -428,7 +485,7 @@ def test_an_ldt_file_has_the_lines_of_the_format():
         (b"IES:LM-63-2019\nTILT=NONE\n1 1000 1 9e9 2 1 2 0 0 0\n1 1 0\n", "at most 2000"),
         (b"IES:LM-63-2019\nTILT=NONE\n1 x\n", "damaged"),
         (b"a\n1\n4\n", "damaged"),
-        (b"a\n1\n4\n5\n1\n6\n", "symmetry 4"),
+        (b"a\n1\n7\n5\n1\n6\n", "symmetry 7"),
         (b"\x00" * 4000, "damaged"),
     ],
 )

@@ -17,7 +17,7 @@ from test_roundtrip import arguments, read_step
 
 from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import flange_radius, lamp_mesh, lamp_parts
-from caustic_cli.export.lamp_mitsuba import companions, plane_of, write_lamp_mitsuba
+from caustic_cli.export.lamp_mitsuba import FINE, companions, plane_of, write_lamp_mitsuba
 from caustic_cli.export.lamp_step import nurbs, write_lamp_step
 from caustic_cli.optics.lamp import ChipRays, land, through
 from caustic_cli.optics.surfaces.polarfield import PolarField
@@ -238,10 +238,10 @@ def test_a_lamp_is_compared_and_another_one_differs(chip, tmp_path, monkeypatch)
         other = InItsPlace(own, ROAD, net)
         monkeypatch.setitem(sys.modules, "mitsuba", other)
         monkeypatch.setattr(lamp_verify, "follow", other.follow)
-        return lamp_verify.verify_lamp(tmp_path, lamp, ROAD, FIELD, values, (24, 16), 300_000)
+        write_lamp_mitsuba(tmp_path / "a.xml", lamp, ROAD, FIELD, values, (24, 16), (5, 20), dark=True)
+        return lamp_verify.verify_lamp(tmp_path / "a.xml", lamp, ROAD, FIELD, values, (24, 16), 300_000)
 
     monkeypatch.setattr(lamp_verify, "choose_variant", lambda: "none")
-    monkeypatch.setattr(lamp_verify, "SAMPLES", (5, 20))
     same = found(lamp, values)
     assert same.agree and 0.7 < same.figures["z_mean_square"] < 1.3, same.figures
     assert not found(replace(lamp, index=1.6), values).agree
@@ -252,11 +252,12 @@ def test_mitsuba_agrees(tmp_path):
     """Only where Mitsuba is installed."""
     pytest.importorskip("mitsuba", exc_type=ImportError)
     lamp, values = Lamp(Chip("rectangle", (1.0, 2.0)), base=1.0, flange=2.0), bumpy(12.0, 0)
-    for goal in (ROAD, Goal((100.0, 60.0))):
-        found = lamp_verify.verify_lamp(tmp_path, lamp, goal, FIELD, values, (24, 16), 100_000)
+    cases = [(lamp, ROAD, values), (lamp, Goal((100.0, 60.0)), values), (Lamp(surfaces=2, inner=3.0), ROAD, TWO)]
+    for own, goal, net in cases:
+        write_lamp_mitsuba(tmp_path / "a.xml", own, goal, FIELD, net, (24, 16), FINE, dark=True)
+        seen = plane_of(goal, own.radius)
+        found = lamp_verify.verify_lamp(tmp_path / "a.xml", own, seen, FIELD, net, (24, 16), 100_000)
         assert found.agree and 0.8 < found.figures["z_mean_square"] < 1.2, found.figures
-    found = lamp_verify.verify_lamp(tmp_path, Lamp(surfaces=2, inner=3.0), ROAD, FIELD, TWO, (24, 16), 100_000)
-    assert found.agree, found.figures
 
 
 def test_the_far_field_is_seen_on_a_distant_plane():

@@ -10,8 +10,8 @@ import torch
 from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lamp import directions_of, pixels_of
-from caustic_cli.inverse.photometric_target import angles_of, picture_of
 from caustic_cli.io.photometry import Photometry, read_photometry, write_ies, write_ldt
+from caustic_cli.project.photometric_target import angles_of, picture_of
 from caustic_cli.scene.lamp import Goal
 
 PLANES, ANGLES = 15.0 * np.arange(24), 5.0 * np.arange(37)

@@ -96,12 +96,12 @@ def run(asked: DesignOptions) -> None:
             compile_behind(["multigrid"], more=True)
     device = asked.start_torch()
 
-    from caustic_cli.config.lamp import asks_for_lamp  # noqa: PLC0415
+    from caustic_cli.config.lamp import asks_for_lamp, says_lamp  # noqa: PLC0415
     from caustic_cli.inverse import ranks  # noqa: PLC0415
     from caustic_cli.workflow import library  # noqa: PLC0415
     from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
-    if not asked.resume and asks_for_lamp(asked.given, asked.preset, asked.config):
+    if says_lamp(project) if asked.resume else asks_for_lamp(asked.given, asked.preset, asked.config):
         with _saying_what_is_kept(path):
             _design_lamp(asked, picture, path)
         return
@@ -130,17 +130,20 @@ def _design_lamp(asked: DesignOptions, picture: Any, path: Path) -> None:
     Raises:
         InputError: an option is given that belongs to a lens with a height field.
     """
-    from caustic_cli.workflow import lamp  # noqa: PLC0415
+    from caustic_cli.workflow import lamp, library  # noqa: PLC0415
 
     if checks.rank_and_size()[1] > 1:
         raise InputError("a lamp is designed by one process, and torchrun has started more")
-    if asked.device == "cuda":
-        raise InputError("a lamp is designed on the CPU: leave out --device cuda")
-    for name in ("movie", "error", "plan"):
-        if getattr(asked, name):
-            raise InputError(f"--{name} is for a lens before its light, not for a lamp around it")
-    how: dict[str, Any] = {"preset": asked.preset, "config": asked.config, "out": path, "force": asked.force, "say": asked.say}
-    figures = lamp.design(picture, asked.given, **how).figures
+    if asked.plan:
+        raise InputError("--plan is for a lens before its light, not for a lamp around it")
+    how: dict[str, Any] = {"force": asked.force, "movie": asked.movie, "say": asked.say}
+    how["device"] = "cuda" if asked.device == "cuda" else "cpu"
+    if asked.resume:
+        iterations, time_limit = (asked.given.get(setting) for setting in CONTINUED)
+        figures = library.resume(picture, iterations=iterations, time_limit=time_limit, **how).figures
+    else:
+        how |= {"preset": asked.preset, "config": asked.config, "out": path, "error": asked.error}
+        figures = library.design_of(picture, asked.given, **how).figures
     asked.say.table(figures["project"], lamp.rows(figures))
     if asked.json:
         console.emit_json(figures)

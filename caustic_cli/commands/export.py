@@ -151,22 +151,18 @@ def _export_lamp(asked: ExportOptions, path: Path) -> None:
         InputError: an option is given that does not apply to lamps, or a format does not hold them.
     """
     from caustic_cli.project.project import Project  # noqa: PLC0415
-    from caustic_cli.workflow import lamp_export as lamp  # noqa: PLC0415
+    from caustic_cli.workflow import lamp, lamp_formats  # noqa: PLC0415
 
     options.refuse_others(asked, ("format", "output", "samples", "milling"))
     samples = tuple(options.both(options.counts("--samples", asked.samples))) if asked.samples else None
     if asked.format is None:
-        suffix = "" if asked.output is None else asked.output.suffix.lower()
-        formats = [name for name, own in lamp.FORMATS.items() if own.suffix == suffix]
-        if not formats:
-            listed = ", ".join(f"{name} ({own.suffix})" for name, own in lamp.FORMATS.items())
-            raise InputError(f"of a lamp a --format is needed, or an --out with its suffix, of {listed}")
+        formats = [lamp_formats.format_of("" if asked.output is None else asked.output.suffix)]
     else:
         formats = [name.strip() for name in asked.format.split(",")]
     if asked.output and len(formats) > 1:
         raise InputError("--out names one file; several formats are written beside each other under the project's own name")
     for name in formats:
-        lamp.check_export(name, samples)
+        lamp_formats.check_export(name, samples)
     project, found = Project.open(path), []
     for name in formats:
         found.append(lamp.export(project, name, asked.output, samples, asked.force, asked.say))

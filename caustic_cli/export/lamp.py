@@ -17,7 +17,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.export.mesh import walls
-from caustic_cli.optics.lamp import sides
+from caustic_cli.optics.lamp import surfaces_of
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Lamp
 
@@ -67,13 +67,6 @@ def lamp_parts(lamp: Lamp, field: PolarField, values: Tensor, samples: tuple[int
     number = np.arange(len(loops) * around).reshape(len(loops), around)
     foot = np.concatenate([walls(one, other) for one, other in itertools.pairwise(number)])
     return (inner, cap[:, ::-1], -inward), (outer, cap, outward), (np.concatenate(loops), foot, None)
-
-
-def surfaces_of(lamp: Lamp, field: PolarField, values: Tensor) -> tuple[tuple[PolarField, Tensor], tuple[PolarField, Tensor]]:
-    """The outer and the inner surface with their control values."""
-    inner, outer = sides(values.detach())
-    sphere = PolarField.uniform((4, 4))
-    return (field, outer), (sphere, sphere.sphere(lamp.inner)) if inner is None else (field, inner)
 
 
 def rim_points(field: PolarField, values: Tensor, angle: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.export.lamp import flange_radius, rim_points, surfaces_of
+from caustic_cli.export.lamp import flange_radius, rim_points
 from caustic_cli.export.step import (
     HEAD,
     OUTLINES,
@@ -36,6 +36,7 @@ from caustic_cli.export.step import (
 )
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.lamp import surfaces_of
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene import CircularAperture
 from caustic_cli.scene.lamp import Lamp

@@ -200,7 +200,9 @@ def design_lamp(
     *,
     effort: Effort = STANDARD,
     seed: int = 0,
+    begun: tuple[int, Tensor] | None = None,
     on_iteration: Callable[[int, int, float], None] = lambda stage, k, loss: None,
+    on_stage: Callable[[int, Tensor], None] = lambda done, values: None,
 ) -> Tensor:
     """The surfaces that send the light of a chip to a picture: control values of r, mm, over the spline spaces `field_of`,
     (n, m) of one or (2, n, m) of two (`optics.lamp.sides`).
@@ -208,20 +210,26 @@ def design_lamp(
     Args:
         picture: as of `wanted`.
         seed: of a chip's rays.
+        begun: number of stages that were done before, and the control values after them.
         on_iteration: called with the number of the stage, that of iterations in it and the loss.
+        on_stage: called with the number of stages that are done, and the control values.
 
     Raises:
         InputError: the picture is black, or the surfaces come too near to each other.
     """
     field = field_of(effort)
-    values = initial_lamp(lamp, goal, field, picture, effort.lamp_cells)
-    refuse_thin(lamp, field, values)
-    for k, (refined, (pixels, rays, iterations, weight)) in enumerate(stages_of(lamp, effort)):
+    if begun is None:
+        values = initial_lamp(lamp, goal, field, picture, effort.lamp_cells)
+        refuse_thin(lamp, field, values)
+        begun = 0, values
+    first, values = begun
+    for k, (refined, (pixels, rays, iterations, weight)) in list(enumerate(stages_of(lamp, effort)))[first:]:
         if refined.surfaces == 2 and values.ndim == 2:
             values = torch.stack([field.sphere(BEGIN * lamp.inner), values])
         target = wanted(goal, picture, pixels_of(goal, pixels))
         objective = LampObjective(refined, goal, field, target, rays, stream(seed, f"stage {k}"), weight)
         values = refine(objective, values, iterations, partial(on_iteration, k))
+        on_stage(k + 1, values)
     if lamp.surfaces == 1:  # the light of one that is a little smaller is the same
         values = min(1.0, lamp.radius / field.extent(values)[1]) * values
     refuse_thin(lamp, field, values)

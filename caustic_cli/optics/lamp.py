@@ -140,6 +140,13 @@ def sides(values: Tensor) -> tuple[Tensor | None, Tensor]:
     return (None, values) if values.ndim == 2 else (values[0], values[1])
 
 
+def surfaces_of(lamp: Lamp, field: PolarField, values: Tensor) -> tuple[tuple[PolarField, Tensor], tuple[PolarField, Tensor]]:
+    """The outer and the inner surface with their control values."""
+    inner, outer = sides(values.detach())
+    sphere = PolarField.uniform((4, 4))
+    return (field, outer), (sphere, sphere.sphere(lamp.inner)) if inner is None else (field, inner)
+
+
 def least_wall(lamp: Lamp, field: PolarField, values: Tensor) -> float:
     """Least distance of the two surfaces, mm; of two free-form ones between points of `PolarField.extent`; negative where the outer
     one is nearer to the origin than the hemisphere."""

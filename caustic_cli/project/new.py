@@ -22,7 +22,7 @@ from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.schema.table import Parameters, TargetSettings
 
-photometric_target = OnDemand("caustic_cli.inverse.photometric_target")
+photometric_target = OnDemand("caustic_cli.project.photometric_target")
 
 
 def new_project(

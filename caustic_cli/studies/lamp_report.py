@@ -21,8 +21,8 @@ from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-from caustic_cli.export.lamp import surfaces_of
 from caustic_cli.io.files import SOFTWARE, atomic_file
+from caustic_cli.optics.lamp import surfaces_of
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Goal, Lamp
 from caustic_cli.studies.photometry import FLUX, IntensityTable

@@ -1,7 +1,7 @@
 """Verification of a lamp against Mitsuba 3, as `verify` does of lenses: its own light, drawn by NumPy, through the exported meshes,
 and images compared bin by bin.
 
-A target in the far field is seen on a distant plane, which both programs trace (`export.lamp_mitsuba.plane_of`).
+A target in the far field is seen on a distant plane, which both programs trace.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import CausticError
-from caustic_cli.export.lamp_mitsuba import plane_of, write_lamp_mitsuba
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
@@ -21,29 +20,27 @@ from caustic_cli.studies.lamp import lamp_image
 from caustic_cli.studies.retrace import BATCHES
 from caustic_cli.studies.verify import TURN, Agreement, choose_variant, compare, follow
 
-#: Surfaces in the order of light, rays traced at a time, and rings and points of the meshes, so many that light turns by TURN at
-#: most.
-SURFACES, CHUNK, SAMPLES = [("inner", False), ("outer", False), ("screen", False)], 1 << 20, (600, 2400)
+#: Surfaces in the order of light, and rays traced at a time.
+SURFACES, CHUNK = [("inner", False), ("outer", False), ("screen", False)], 1 << 20
 
 
 def verify_lamp(
-    folder: Path, lamp: Lamp, goal: Goal, field: PolarField, values: Tensor, pixels: tuple[int, int], rays: int, seed: int = 0
+    scene: Path, lamp: Lamp, seen: Goal, field: PolarField, values: Tensor, pixels: tuple[int, int], rays: int, seed: int = 0
 ) -> Agreement:
     """Trace a lamp here and its exported scene in Mitsuba, with about `rays` rays each, and compare on pixels of its target.
 
-    folder: where the scene is written.
+    seen: the target, a plane.
 
     Raises:
         CausticError: no variant of Mitsuba works on this machine, or no light reaches the target.
     """
-    variant, scene = choose_variant(), folder / "lamp.xml"
+    variant = choose_variant()
     import mitsuba as mi  # noqa: PLC0415
 
     mi.set_log_level(mi.LogLevel.Error)
-    write_lamp_mitsuba(scene, lamp, goal, field, values, pixels, SAMPLES, dark=True)
     world = mi.load_file(str(scene), optimize=False)
     shapes = {shape.id(): shape for shape in world.shapes()}
-    seen, rng = plane_of(goal, lamp.radius), np.random.default_rng([seed, 1])
+    rng = np.random.default_rng([seed, 1])
     image, squares = np.zeros((2, *pixels))
     for start in range(0, rays, CHUNK):
         *points, weight = follow(mi, world, shapes, SURFACES, *_emitted(lamp.chip, min(CHUNK, rays - start), rng))

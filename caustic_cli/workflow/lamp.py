@@ -1,7 +1,7 @@
 """Lamps: their design and render, as those of lenses in `design` and `render`; their export is `lamp_export`.
 
-A lamp is a project like others, whose checkpoint holds the control values of r instead of heights.  It is written when its
-design has ended; an interrupted one is begun anew.
+A lamp is a project like others, whose checkpoint holds the control values of r instead of heights.  It is written after every
+stage, with which an interrupted design goes on.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from caustic_cli import __version__
 from caustic_cli.config.lamp import goal_of, lamp_of
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
-from caustic_cli.export.lamp_mitsuba import plane_of
+from caustic_cli.export.lamp_mitsuba import FINE, plane_of, write_lamp_mitsuba
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, stages_of, wanted
@@ -30,16 +30,18 @@ from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.surfaces.polarfield import PolarField
-from caustic_cli.project import directory, uptodate
+from caustic_cli.project import checkpoint, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.new import new_project
-from caustic_cli.project.project import RENDER, REPORT, Project
+from caustic_cli.project.project import CHECKPOINT, RENDER, REPORT, Project
 from caustic_cli.scene.lamp import Goal, Lamp
 from caustic_cli.studies.lamp import lamp_figures
 from caustic_cli.studies.lamp_verify import verify_lamp
 from caustic_cli.studies.photometry import IntensitySum, IntensityTable
 from caustic_cli.studies.tolerances import one_thread
 from caustic_cli.studies.verify import write_panels
+from caustic_cli.workflow import lamp_formats
+from caustic_cli.workflow.lens import Render, count
 from caustic_cli.workflow.reporter import Reporter
 
 lamp_report = OnDemand("caustic_cli.studies.lamp_report")
@@ -97,8 +99,12 @@ class LampDesign:
     @property
     def name(self) -> str:
         """Its name in files: that of its project."""
-        assert self.project.path is not None
-        return self.project.path.resolve().stem
+        return "lamp" if self.project.path is None else self.project.path.resolve().stem
+
+    @property
+    def exported(self) -> lamp_formats.Exported:
+        """As it is written in a format."""
+        return lamp_formats.Exported(self.lamp, self.goal, self.field, self.values, self.name, self.project.seed)
 
     def evaluated(self, rays: int | None, seed: int) -> Evaluation:
         """The light by independent rays; rays: None for those of the evaluation of a design."""
@@ -115,6 +121,25 @@ class LampDesign:
         table = intensities.table()
         return Evaluation(found.image, fine, table, figures | table.figures)
 
+    def render(self, rays: float | None = None, *, seed: int | None = None) -> Render:
+        """Trace the lamp with independent rays: part of the light on each pixel, and the figures of `caustic render`.
+
+        rays: None for those of the evaluation of a design.
+        """
+        seen = self.evaluated(None if rays is None else count(rays), self.project.seed if seed is None else seed)
+        return Render(seen.image, seen.figures)
+
+    def export(self, path: str | Path, format: str | None = None, *, samples: tuple[int, int] | None = None) -> Path:
+        """Export the lamp or its light; the format follows from the suffix unless it is given; samples: rings, and points of each.
+
+        Raises:
+            InputError: the format is not one of a lamp, or has no samples.
+        """
+        name = format or lamp_formats.format_of(Path(path).suffix)
+        lamp_formats.check_export(name, samples)
+        lamp_formats.write(Path(path), self.exported, name, samples)
+        return Path(path)
+
     def write_report(self, path: Path, found: Evaluation) -> None:
         """Write the report of an evaluation."""
         of = (self.lamp, self.goal, self.field, self.values)
@@ -128,7 +153,9 @@ class LampDesign:
         """
         pixels, seen = pixels_of(self.goal, VERIFIED), plane_of(self.goal, self.lamp.radius)
         with TemporaryDirectory() as folder:
-            found = verify_lamp(Path(folder), self.lamp, self.goal, self.field, self.values, pixels, rays, seed)
+            scene = Path(folder) / "lamp.xml"
+            write_lamp_mitsuba(scene, self.lamp, self.goal, self.field, self.values, pixels, FINE, dark=True)
+            found = verify_lamp(scene, self.lamp, seen, self.field, self.values, pixels, rays, seed)
         write_panels(panels, found, (0.5 * seen.size[0], 0.5 * seen.size[1]))
         return found.figures | {"image": str(panels)}
 
@@ -155,44 +182,77 @@ def design(
     Raises:
         InputError: invalid input; nothing was written.
     """
-    began = Start.now()
     project, _ = new_project(target, given, preset, config, out, say.say)
     if out is not None and not force and (same := uptodate.same_design(out, project.asked)):
-        say.say(
-            f"{out}: was designed from the same picture with the same options, so there is nothing to do; ⟨force⟩ designs it anew"
-        )
-        return LampDesign.of(same[0])
+        say.say(f"{out}: was designed from the same picture with the same options")
+        return resume(same[0], say)
     if out is not None:
         directory.check(out, force)
-    s, effort = project.settings, current_effort()
-    lamp, goal, picture = lamp_of(s), goal_of(s), picture_of(project)
+    return _run(project, None, force, say)
+
+
+def resume(project: Project, say: Reporter) -> LampDesign:
+    """Go on with the design of a project after its last complete stage; a finished one is opened.
+
+    Raises:
+        InputError: there is no lamp.
+    """
+    saved = project.load()
+    if saved.results:
+        say.say(f"{project.path}: is finished, so there is nothing to do; ⟨force⟩ designs it anew")
+        return LampDesign.of(project)
+    if saved.state.heights.shape[-2:] != field_of(current_effort()).shape:
+        raise project.error("holds a lamp of another effort in its checkpoint: design it again")
+    with project.hold:
+        assert project.path is not None
+        project.hold.enter_context(directory.locked(project.path))
+        return _run(project, saved.state, True, say)
+
+
+def _run(project: Project, before: State | None, force: bool, say: Reporter) -> LampDesign:
+    """Design a lamp after the stages that were done `before`, and evaluate it; the checkpoint is written after each stage."""
+    began, s, effort = Start.now(), project.settings, current_effort()
+    lamp, goal, picture, field = lamp_of(s), goal_of(s), picture_of(project), field_of(effort)
     for words in notes(lamp, goal):
         say.say(words)
     stages = stages_of(lamp, effort)
     last, total = len(stages), sum(iterations for _, (_, _, iterations, _) in stages)
-    history = list[tuple[int, int, float, float, float]]()
-    with say.progress(total) as show:
+    state = State(torch.empty(0)) if before is None else before
+    history, earlier = list(state.history), state.seconds
+    made = {"caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "seed": s.design.seed}
 
-        def told(stage: int, _: int, loss: float) -> None:
-            history.append((len(history) + 1, stage, loss, 0.0, began.seconds))
-            show(f"stage {stage + 1}/{last}", f"loss {loss:.5f}", len(history), total)
+    def told(stage: int, _: int, loss: float) -> None:
+        history.append((len(history) + 1, stage, loss, 0.0, earlier + began.seconds))
+        show(f"stage {stage + 1}/{last}", f"loss {loss:.5f}", len(history), total)
 
-        with one_thread():  # the tensors of a chunk of rays are too small for more
-            values = design_lamp(lamp, goal, picture, effort=effort, seed=s.design.seed, on_iteration=told)
-    found = LampDesign(project, lamp, goal, field_of(effort), values, picture, {})
-    evaluation = found.evaluated(None, s.design.seed)
-    figures = evaluation.figures | {"iterations": len(history), "seconds": began.seconds, "reason": "iterations"}
-    if out is not None:
-        figures |= {"image": str(out / RENDER), "project": str(out)}
-        state = State(
-            values, len(effort.lamp_stages) - 1, 0, len(history), history=history, seconds=began.seconds, reason="iterations"
-        )
-        made = {"caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "seed": s.design.seed}
-        with project.hold:
-            directory.create(project, force, Checkpoint(state, found.field.spaces, made, figures, uptodate.inputs(project)))
-            _write_image(out / RENDER, evaluation.image, project, goal)
+    def save(done: int, values: Tensor, figures: dict[str, Any] | None = None) -> None:
+        nonlocal before
+        if project.path is None:
+            return
+        why = {"reason": "iterations"} if figures else {}
+        state = State(values, done, 0, len(history), history=list(history), seconds=earlier + began.seconds, **why)
+        saved = Checkpoint(state, field.spaces, made, figures or {}, uptodate.inputs(project))
+        if before is None:
+            directory.create(project, force, saved)
+        else:
+            checkpoint.save(project.path / CHECKPOINT, saved)
+        before = state
+
+    with project.hold:
+        with say.progress(total) as show, one_thread():  # the tensors of a chunk of rays are too small for more threads
+            begun = None if before is None else (before.stage, before.heights)
+            how: dict[str, Any] = {"effort": effort, "seed": s.design.seed, "begun": begun}
+            values = design_lamp(lamp, goal, picture, **how, on_iteration=told, on_stage=save)
+        found = LampDesign(project, lamp, goal, field, values, picture, {})
+        evaluation = found.evaluated(None, s.design.seed)
+        seconds = earlier + began.seconds
+        figures = evaluation.figures | {"iterations": len(history), "seconds": seconds, "reason": "iterations"}
+        if project.path is not None:
+            figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
+            _write_image(project.path / RENDER, evaluation.image, project, goal)
             if effort.report:
-                found.write_report(out / REPORT, evaluation)
+                found.write_report(project.path / REPORT, evaluation)
+        save(last, values, figures)
     return replace(found, figures=figures)
 
 
@@ -255,6 +315,31 @@ def render(
     if panels is not None:
         figures["verify"] = lamp.verified(panels, rays or BESIDE_RAYS, project.seed if seed is None else seed)
         return figures
+    made.keep(figures)
+    return figures
+
+
+def export(
+    project: Project, format: str, output: Path | None, samples: tuple[int, int] | None, force: bool, say: Reporter
+) -> dict[str, Any]:
+    """Write a lamp in one of `lamp_formats.FORMATS`; returns file, format, bytes, seconds, and beside, the further files; of a
+    photometric file the flux of its light, lm per 1000 lm of the chip, and peak_candela.
+
+    Raises:
+        InputError: there is no lamp, the format is not one of a lamp, or a file exists already; nothing was written.
+    """
+    began = time.monotonic()
+    lamp_formats.check_export(format, samples)
+    assert project.path is not None
+    own = lamp_formats.FORMATS[format]
+    path = output or Path(project.path.resolve().stem + own.suffix)
+    made = uptodate.Outputs(project, "export", {"format": format, "samples": samples}, [path, *own.companions(path)])
+    if not force and (found := made.found()):
+        say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
+        return found
+    made.refuse_foreign(force)
+    more = lamp_formats.write(path, LampDesign.of(project).exported, format, samples)
+    figures = {"file": str(path), "format": format, "bytes": path.stat().st_size, **more, "seconds": time.monotonic() - began}
     made.keep(figures)
     return figures
 

@@ -1,12 +1,13 @@
-"""Export of lamps: their solid, a scene for Mitsuba, and their light as photometric files."""
+"""Formats of lamps: their solid, a scene for Mitsuba, and their light as photometric files."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from torch import Tensor
 
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
@@ -16,14 +17,23 @@ from caustic_cli.export.lamp_step import write_lamp_step
 from caustic_cli.inverse.lamp import pixels_of
 from caustic_cli.io.photometry import Photometry, write_ies, write_ldt
 from caustic_cli.optics.lamp import sides
-from caustic_cli.project import uptodate
-from caustic_cli.project.project import Project
+from caustic_cli.optics.surfaces.polarfield import PolarField
+from caustic_cli.scene.lamp import Goal, Lamp
 from caustic_cli.studies.photometry import FLUX, intensity_table
-from caustic_cli.workflow.lamp import LampDesign
-from caustic_cli.workflow.reporter import Reporter
 
 #: Rings, and points of each.
 Samples = tuple[int, int]
+
+
+class Exported(NamedTuple):
+    """A lamp: control values of r, mm, see `optics.lamp.sides`; its name, and the seed of the rays of its light."""
+
+    lamp: Lamp
+    goal: Goal
+    field: PolarField
+    values: Tensor
+    name: str
+    seed: int
 
 
 class Format(NamedTuple):
@@ -31,27 +41,27 @@ class Format(NamedTuple):
     the names of further files."""
 
     suffix: str
-    write: Callable[[Path, LampDesign, Samples], dict[str, Any] | None]
+    write: Callable[[Path, Exported, Samples], dict[str, Any] | None]
     sampled: bool = True
     companions: Callable[[Path], list[Path]] = lambda path: []
 
 
-def _mesh(write: Callable[..., None], path: Path, found: LampDesign, samples: Samples) -> None:
+def _mesh(write: Callable[..., None], path: Path, found: Exported, samples: Samples) -> None:
     write(path, *lamp_mesh(found.lamp, found.field, found.values, samples))
 
 
-def _step(path: Path, found: LampDesign, _: Samples) -> None:
+def _step(path: Path, found: Exported, _: Samples) -> None:
     write_lamp_step(path, found.lamp, found.field, found.values)
 
 
-def _mitsuba(path: Path, found: LampDesign, samples: Samples) -> None:
+def _mitsuba(path: Path, found: Exported, samples: Samples) -> None:
     pixels = pixels_of(found.goal, current_effort().lamp_stages[-1][0])
     lamp_mitsuba.write_lamp_mitsuba(path, found.lamp, found.goal, found.field, found.values, pixels, samples)
 
 
-def _photometry(write: Callable[[Path, Photometry], None], path: Path, found: LampDesign, _: Samples) -> dict[str, Any]:
+def _photometry(write: Callable[[Path, Photometry], None], path: Path, found: Exported, _: Samples) -> dict[str, Any]:
     """flux, lm per 1000 lm of the chip, and peak_candela."""
-    table = intensity_table(found.lamp, found.field, found.values, rays=current_effort().final_rays, seed=found.project.seed)
+    table = intensity_table(found.lamp, found.field, found.values, rays=current_effort().final_rays, seed=found.seed)
     greatest, name = found.field.extent(sides(found.values)[1])[1], found.name
     write(path, Photometry(table.planes, table.angles, table.values, FLUX, name, 2.0 * greatest, greatest))
     return {"flux": table.flux, "peak_candela": table.peak}
@@ -83,28 +93,20 @@ def check_export(format: str, samples: Samples | None) -> None:
         raise InputError(f"⟨samples⟩ belongs to {', '.join(name for name in FORMATS if FORMATS[name].sampled)}, got {format}")
 
 
-def export(
-    project: Project, format: str, output: Path | None, samples: Samples | None, force: bool, say: Reporter
-) -> dict[str, Any]:
-    """Write a lamp in one of FORMATS; returns file, format, bytes, seconds, and beside, the further files; of a photometric file
-    the flux of its light, lm per 1000 lm of the chip, and peak_candela.
+def format_of(suffix: str) -> str:
+    """The format of this suffix.
 
     Raises:
-        InputError: there is no lamp, the format is not one of a lamp, or a file exists already; nothing was written.
+        InputError: there is none.
     """
-    began = time.monotonic()
-    check_export(format, samples)
-    assert project.path is not None
+    if found := [name for name, own in FORMATS.items() if own.suffix == suffix.lower()]:
+        return found[0]
+    listed = ", ".join(f"{name} ({own.suffix})" for name, own in FORMATS.items())
+    raise InputError(f"of a lamp a ⟨format⟩ is needed, or an ⟨out⟩ with its suffix, of {listed}")
+
+
+def write(path: Path, found: Exported, format: str, samples: Samples | None) -> dict[str, Any]:
+    """Write a lamp in a format that was checked; returns further figures, and beside, the further files."""
     own = FORMATS[format]
-    path = output or Path(project.path.resolve().stem + own.suffix)
-    beside = own.companions(path)
-    made = uptodate.Outputs(project, "export", {"format": format, "samples": samples}, [path, *beside])
-    if not force and (found := made.found()):
-        say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
-        return found
-    made.refuse_foreign(force)
-    more = own.write(path, LampDesign.of(project), samples or SAMPLES) or {}
-    more |= {"beside": list(map(str, beside))} if beside else {}
-    figures = {"file": str(path), "format": format, "bytes": path.stat().st_size, **more, "seconds": time.monotonic() - began}
-    made.keep(figures)
-    return figures
+    figures, beside = own.write(path, found, samples or SAMPLES) or {}, own.companions(path)
+    return figures | ({"beside": list(map(str, beside))} if beside else {})
