@@ -25,6 +25,7 @@ from caustic_cli.export.lamp import MESHES, write_lamp
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, stages_of, wanted
+from caustic_cli.inverse.lamp_limits import chip_limits
 from caustic_cli.io.files import Piped
 from caustic_cli.io.photometry import Photometry, write_ies, write_ldt
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
@@ -88,10 +89,8 @@ class LampDesign:
         for those of the evaluation of a design."""
         effort = current_effort()
         rays = rays or effort.final_rays
-        stages = effort.lamp_stages
-        fine, coarse = (
-            wanted(self.goal, self.picture, pixels_of(self.goal, count)).numpy() for count in (4 * stages[-1][0], stages[1][0])
-        )
+        counts = effort.lamp_pixels, effort.lamp_pixels // 16
+        fine, coarse = (wanted(self.goal, self.picture, pixels_of(self.goal, count)).numpy() for count in counts)
         shaded = len(np.unique(self.picture[self.picture > 0])) > 1
         found, figures = lamp_figures(
             self.lamp, self.goal, self.field, self.values, fine, coarse, shaded=shaded, rays=rays, seed=seed
@@ -135,7 +134,7 @@ def design(
         directory.check(out, force)
     s, effort = project.settings, current_effort()
     lamp, goal, picture = lamp_of(s), goal_of(s), picture_of(project)
-    for words in notes(lamp, goal):
+    for words in (*notes(lamp, goal), *chip_limits(lamp, goal, picture, effort.bound_steps)):
         say.say(words)
     stages = stages_of(lamp, effort)
     last, total = len(stages), sum(iterations for _, (_, _, iterations, _) in stages)
@@ -147,7 +146,7 @@ def design(
             show(f"stage {stage + 1}/{last}", f"loss {loss:.5f}", len(history), total)
 
         with one_thread():  # the tensors of a chunk of rays are too small for more
-            values = design_lamp(lamp, goal, picture, effort=effort, seed=s.design.seed, on_iteration=told)
+            values = design_lamp(lamp, goal, picture, effort=effort, on_iteration=told)
     found = LampDesign(project, lamp, goal, field_of(effort), values, picture, {})
     image, figures = found.image_and_figures(None, s.design.seed)
     figures |= {"iterations": len(history), "seconds": began.seconds, "reason": "iterations"}
@@ -169,11 +168,10 @@ def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
     if lamp.surfaces == 2:
         return
     most = math.degrees(math.acos(1.0 / lamp.index))
-    sides = [math.radians(s / 2) if goal.far else math.atan(s / 2 / goal.distance) for s in goal.size]
-    if (needed := 90.0 - math.degrees(min(sides))) > most:
+    if (needed := 90.0 - goal.nearest_edge) > most:
         yield (
             f"one surface of index {lamp.index:.4g} turns light by at most {most:.1f} degrees, and that of the rim would have to be"
-            f" turned by {needed:.0f} to reach the nearer edges of the picture: part of it falls beside"
+            f" turned by {needed:.0f} to reach the nearest edge of the picture: part of it falls beside"
         )
 
 
@@ -266,12 +264,15 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("on target", f"{figures['of_source']:.2%} of all light; uncoated limit {figures['uncoated_limit']:.2%}"),
         (
             "relative RMS error",
-            f"{number('interior_rms', '.4f')}, noise {number('interior_noise', '.2g')}; with the outer 2.5 %"
+            f"{number('interior_rms', '.4f')}, noise {number('interior_noise', '.2g')}; with the outer"
+            f" {number('border', '.4g')} {'degrees' if 'peak_candela' in figures else 'mm'}"
             f" {number('relative_rms', '.4f')}, noise {number('noise', '.2g')}",
         ),
         ("least over mean", number("uniformity", ".3f")),
         ("lost", ", ".join(f"{name} {part:.2%}" for name, part in lost.items()) or "nothing"),
     ]
+    if figures.get("cut_off") is not None:
+        found.append(("upper edge", f"{figures['cut_off']:.2f} degrees from 90 % to 10 % of the intensity beneath it"))
     if "peak_candela" in figures:
         angles = " x ".join(f"{angle:.0f}" for angle in figures["beam_angles"])
         found.append(("peak", f"{figures['peak_candela']:.0f} cd per 1000 lm of the chip; half of it at {angles} degrees"))
