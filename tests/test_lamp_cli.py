@@ -106,6 +106,17 @@ def test_a_design_in_the_far_field_tells_its_peak_and_its_angles(capfd):
     assert "cd per 1000 lm" in capfd.readouterr().out
 
 
+def test_a_lamp_may_stand_beside_its_picture(capfd):
+    given = ["--lamp", "15", "--throw", "8m", "--picture-size", "16mx8m", "--screen-shift", "0,3m", "--lamp-inner", "2"]
+    assert cli.run(["design", "uniform", *given, "-o", "beside"]) == 0
+    assert "turned by 83 to reach the nearest edge" in capfd.readouterr().err
+    figures = figures_of(capfd, "render", "beside", "--rays", "20000", "-o", "a.png", "--npy", "a.npy")
+    assert figures["of_source"] > 0.75
+    assert Project.open("beside").settings.screen.shift == (0.0, 3000.0)
+    seen = np.load("a.npy").sum(0)
+    assert seen[: len(seen) // 2].sum() == pytest.approx(0.5 * seen.sum(), rel=0.15)  # either half of the picture is lit
+
+
 def test_a_chip_of_any_shape_is_designed_for(capfd):
     for shape in ("rectangle", "disc"):
         given = ["--chip", "1x0.5", "--chip-shape", shape, "--glass", "PMMA", "-o", shape]
@@ -137,7 +148,7 @@ def test_two_surfaces_are_designed_rendered_and_exported(capfd):
     figures = figures_of(capfd, "design", "uniform", *ROAD[:-1], "--lamp-surfaces", "2", "--chip", "0.5", "-o", "two")
     assert figures["of_source"] > 0.8 and figures["least_wall"] > 1.0
     found = LampDesign.of(Project.open("two"))
-    assert found.values.shape == (2, 24, 24) and found.lamp.inner == 2.0
+    assert found.values.shape == (2, 19, 19) and found.lamp.inner == 2.0
     seen = figures_of(capfd, "render", "two", "--rays", "20000", "-o", "two.png")
     assert seen["of_source"] == pytest.approx(figures["of_source"], abs=0.02)
     vertices, faces = lamp_mesh(found.lamp, found.field, found.values, (40, 90))
@@ -245,6 +256,7 @@ def test_lamps_are_designed_rendered_and_exported_from_python(road):
         (["--lamp", "15", "--screen", "far"], "needs --angles"),
         (["--lamp", "15", "--screen", "floor:1m", "--angles", "60"], "of a lamp must be far"),
         (["--lamp", "15", "--angles", "60", "--throw", "2m"], "leave out its distance"),
+        (["--lamp", "15", "--angles", "60", "--screen-shift", "0,1m"], "leave out its distance, its size and its shift"),
         (["--lamp", "15", "--angles", "200"], "at most 178"),
         (["--lamp", "0", "--angles", "60"], "--lamp must be"),
         (["--lamp", "nan", "--angles", "60"], "--lamp"),

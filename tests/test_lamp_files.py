@@ -198,7 +198,7 @@ def test_a_flange_without_thickness_is_refused():
 # Mitsuba
 
 
-ROAD = Goal((9000.0, 6000.0), 4000.0)
+ROAD = Goal((9000.0, 6000.0), 4000.0, (300.0, -500.0))
 
 
 class InItsPlace:
@@ -227,7 +227,8 @@ class InItsPlace:
         with torch.no_grad():
             light = through(self.lamp, FIELD, rays, self.values)
         x, y, ahead = land(self.goal, light)
-        return x.numpy(), y.numpy(), None, torch.where(ahead, light.power, 0.0 * x).numpy()
+        power = torch.where(ahead, light.power, 0.0 * x).numpy()
+        return x.numpy() + self.goal.shift[0], y.numpy() + self.goal.shift[1], None, power
 
 
 @pytest.mark.parametrize("chip", [Chip(), Chip("disc", (1.5, 1.0)), Chip("rectangle", (1.0, 2.0))])

@@ -33,8 +33,8 @@ class DesignOptions(options.Computation):
         Path,
         typer.Argument(
             metavar="TARGET",
-            help="The picture: an image file or a 2-D .npy of irradiance, - for standard input, or uniform or disc where there is"
-            " no such file; of a lamp also the light of a photometric file, .ies or .ldt; with --resume, the project.",
+            help="The picture: an image file or a 2-D .npy of irradiance, - for standard input, or uniform, disc or headlamp where"
+            " there is no such file; of a lamp also the light of a photometric file, .ies or .ldt; with --resume, the project.",
             show_default=False,
         ),
     ]

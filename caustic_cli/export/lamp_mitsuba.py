@@ -63,7 +63,7 @@ def write_lamp_mitsuba(
     for name, (points, faces, normals) in zip(PARTS, parts, strict=True):
         write_mesh(beside(path, name), points, faces, normals)
     seen = plane_of(goal, lamp.radius)
-    screen = Screen(seen.size, seen.distance, pixels)
+    screen = Screen(seen.size, seen.distance, pixels, shift=seen.shift)
     smooth = [f'<shape type="ply" id="{name}">{file_of(path, name)}{dielectric(lamp.index)}</shape>' for name in PARTS[:2]]
     lines = [
         *camera(screen, True, float(parts[1][0][:, 2].max())),

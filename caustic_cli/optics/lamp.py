@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ from caustic_cli.optics.surfaces.polarfield import (
     PolarField,
     PolarHit,
     Vectors,
+    direction_of,
     frame,
     from_frame,
     polar_hit,
@@ -45,6 +47,10 @@ SHALLOW = 0.02
 PROBES = 3
 #: Rays traced at a time.
 CHUNK = 1 << 17
+#: The constant a of a `PointGrid`, and its points over those of them within the circle.
+DENSER, CORNERS = 1.0, 1.1
+#: Steps of an additive sequence that covers the unit square evenly (Roberts 2018, from the plastic number).
+LATTICE = (0.7548776662466927, 0.5698402909980532)
 _DEGREE = 180.0 / math.pi
 
 
@@ -81,6 +87,12 @@ def concentric(s: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     return r * torch.cos(angle), r * torch.sin(angle)
 
 
+def on_chip(chip: Chip, s: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Points of a chip with an extent, mm, of equal area for equal area of the unit square."""
+    x, y = (2.0 * s - 1.0, 2.0 * t - 1.0) if chip.shape == "rectangle" else concentric(s, t)
+    return 0.5 * chip.size[0] * x, 0.5 * chip.size[1] * y
+
+
 def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
     """About `count` rays of equal power, CHUNK at a time: stratified ones of a point, a Sobol sequence of a wider chip."""
     point, side = chip.shape == "point", max(1, round(math.sqrt(count)))
@@ -92,11 +104,35 @@ def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
             x = y = torch.zeros_like(s)
         else:
             s, t, k, m = numbers("sobol", (1, 1), seed, 4, start, stop)
-            x, y = (2.0 * k - 1.0, 2.0 * m - 1.0) if chip.shape == "rectangle" else concentric(k, m)
-            x, y = 0.5 * chip.size[0] * x, 0.5 * chip.size[1] * y
+            x, y = on_chip(chip, k, m)
         dx, dy = concentric(s, t)
         dz = (1.0 - dx * dx - dy * dy).clamp_min(0.0).sqrt()
         yield ChipRays((x, y, torch.zeros_like(x)), (dx, dy, dz), torch.full_like(dx, 1.0 / total))
+
+
+def chip_grids(chip: Chip, points: int, count: int) -> Iterator[ChipRays]:
+    """About `count` rays from points x points places of a chip, CHUNK at a time, of unequal power: in a grid of directions
+    (u, v), displaced from place to place by a part of its cells.
+
+    The places have the mean square distances of the chip's points.  Their images are as smooth as those of a `PointGrid`, which a
+    design needs more than independence of the rays.
+    """
+    middle = (torch.arange(points, dtype=torch.float64) + 0.5) / points
+    s, t = (c.reshape(-1) for c in torch.meshgrid(middle, middle, indexing="ij"))
+    square = 1.0 / 12.0 if chip.shape == "rectangle" else 1.0 / 16.0
+    x, y = (c * (square * d * d / (c * c).mean()).sqrt() for c, d in zip(on_chip(chip, s, t), chip.size, strict=True))
+    side = max(1, round(math.sqrt(count / len(x) * 4.0 / math.pi)))
+    each = max(1, CHUNK // (side * side))
+    cells, total = torch.arange(side, dtype=torch.float64), 0.0
+    parts = []
+    for places in torch.arange(len(x)).split(each):
+        u, v = ((cells + ((places[:, None] + 1) * step).frac()) * (2.0 / side) - 1.0 for step in LATTICE)
+        u, v = (c.reshape(-1) for c in torch.broadcast_tensors(u[:, :, None], v[:, None, :]))
+        lit = u * u + v * v < 1.0
+        at, u, v = places.repeat_interleave(side * side)[lit], u[lit], v[lit]
+        parts.append(ChipRays((x[at], y[at], torch.zeros_like(u)), direction_of(u, v), lambertian(u, v)))
+        total += float(parts[-1].power.sum())
+    return (part._replace(power=part.power / total) for part in parts)
 
 
 def lambertian(u: Tensor, v: Tensor) -> Tensor:
@@ -108,20 +144,27 @@ def lambertian(u: Tensor, v: Tensor) -> Tensor:
 class PointGrid:
     """Rows of a tensor grid of directions (u, v) of the light of a point, without the corners that it does not reach.
 
+    The coordinates of equispaced s are u = tan(a s) / tan(a): denser about the axis, where most of the light is, so that rays are
+    of less unequal power.
+
     u, v: (N,) coordinates of the directions; power: (N,), of sum 1 over all rows.
     """
 
     def __init__(self, field: PolarField, sample: Sample):
-        u, v = torch.meshgrid(2.0 * sample.u - 1.0, 2.0 * sample.v - 1.0, indexing="ij")
+        s, t = (2.0 * c - 1.0 for c in (sample.u, sample.v))
+        u, v = (torch.tan(DENSER * c) / math.tan(DENSER) for c in (s, t))
+        sample = replace(sample, u=0.5 * (u + 1.0), v=0.5 * (v + 1.0))
+        stretch = torch.outer(*(1.0 / torch.cos(DENSER * c) ** 2 for c in (s, t))).reshape(-1)
+        u, v = torch.meshgrid(u, v, indexing="ij")
         self.lit = (u * u + v * v < 1.0).reshape(-1).nonzero()[:, 0]
         self.u, self.v = u.reshape(-1)[self.lit], v.reshape(-1)[self.lit]
-        self.power = lambertian(self.u, self.v)
+        self.power = lambertian(self.u, self.v) * stretch[self.lit]
         self._surface = field.net.prepare(sample, torch.float64)
 
     @classmethod
     def of(cls, field: PolarField, count: int) -> list[PointGrid]:
         """About `count` rays, CHUNK at a time: small tensors stay in the cache of the processor."""
-        sampler = Sampler.of_size("grid", max(1, round(count * 4.0 / math.pi)))
+        sampler = Sampler.of_size("grid", max(1, round(count * CORNERS)))
         grids = [cls(field, sample) for sample in sampler.chunks(CHUNK)]
         total = sum(float(grid.power.sum()) for grid in grids)
         for grid in grids:
@@ -262,7 +305,7 @@ def _leave(lamp: Lamp, hit: PolarHit, local: Vectors, power: Tensor, lost: dict[
 
 
 def land(goal: Goal, light: LampLight) -> tuple[Tensor, Tensor, Tensor]:
-    """Coordinates of the light on the target, mm or degrees, and whether it travels towards it.
+    """Coordinates of the light from the centre of the target, mm or degrees, and whether it travels towards it.
 
     Light towards z <= 0 never meets a plane: it has the coordinates of a shallow ray.
     """
@@ -271,4 +314,4 @@ def land(goal: Goal, light: LampLight) -> tuple[Tensor, Tensor, Tensor]:
         return torch.atan2(dx, dz) * _DEGREE, torch.asin(dy.clamp(-1.0 + 1e-12, 1.0 - 1e-12)) * _DEGREE, dz > 0
     ahead = dz > SHALLOW
     t = (goal.distance - z) / torch.where(ahead, dz, torch.full_like(dz, SHALLOW))
-    return x + t * dx, y + t * dy, ahead
+    return x + t * dx - goal.shift[0], y + t * dy - goal.shift[1], ahead

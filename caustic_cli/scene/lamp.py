@@ -17,6 +17,8 @@ from caustic_cli.errors import InputError
 SHAPES = ("point", "disc", "rectangle")
 #: Widest target in the far field, degrees, along x and y: a lamp emits into z > 0.
 WIDEST = 178.0
+#: Border of a target, a fraction of its smaller side, that is no part of its interior: least, and most where a chip blurs more.
+BORDERS = (0.025, 0.1)
 #: Largest ratio of its sides, and least distance of a plane target in radii of the lens.
 OBLONG, NEAREST = 100.0, 2.0
 
@@ -52,7 +54,7 @@ class Chip:
 
 @dataclass(frozen=True)
 class Goal:
-    """Where the light is wanted: a rectangle centred on the axis, of a plane z = distance, or of angles in the far field.
+    """Where the light is wanted: a rectangle of a plane z = distance, or of angles in the far field, centred on the axis there.
 
     Angles are those of type A photometry: along x the longitude about the y axis, atan2(x, z), along y the latitude, asin y.
 
@@ -64,6 +66,8 @@ class Goal:
     size: tuple[float, float]
     #: Of the plane, mm; inf for the far field.
     distance: float = math.inf
+    #: Of its centre on the plane, from the axis, mm; 0 in the far field.
+    shift: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):
         if not all(0 < s < math.inf for s in self.size):
@@ -74,6 +78,10 @@ class Goal:
             )
         if not self.distance > 0:
             raise InputError(f"the distance of a target must be greater than 0 mm, or inf, got {self.distance}")
+        if not all(math.isfinite(s) for s in self.shift):
+            raise InputError(f"the shift of a target must be finite, got {self.shift}")
+        if self.far and self.shift != (0.0, 0.0):
+            raise InputError(f"a target in the far field is centred on the axis, got a shift of {self.shift}")
         if self.far and max(self.size) > WIDEST:
             raise InputError(f"a target in the far field is at most {WIDEST:g} degrees wide and high, got {self.size}")
 
@@ -88,6 +96,14 @@ class Goal:
         if self.far:
             along = np.diff(np.sin(np.radians(self.size[1] * (np.arange(pixels[1] + 1) / pixels[1] - 0.5))))
         return np.outer(across / across.sum(), along / along.sum())
+
+    @property
+    def nearest_edge(self) -> float:
+        """Angle from the axis of the middle of the nearest edge, degrees; negative if the axis misses the target."""
+        if self.far:
+            return min(self.size) / 2
+        reach = min(s / 2 - abs(c) for c, s in zip(self.shift, self.size, strict=True))
+        return math.degrees(math.atan(reach / self.distance))
 
     @property
     def unit(self) -> str:
@@ -136,6 +152,17 @@ class Lamp:
                 f"⟨lamp.radius⟩ must be greater than ⟨+lamp.inner⟩ and ⟨+lamp.wall⟩ together, {self.inner + self.wall:g} mm, got"
                 f" {self.radius:g} mm"
             )
+
+    def blur(self, goal: Goal) -> float:
+        """Full width of a point of the picture, mm or degrees: the chip as seen from the greatest radius of the lens, on the
+        axis.  It is wider off the axis, and where the surface is nearer to the chip."""
+        angle = max(self.chip.size) / self.radius
+        return math.degrees(angle) if goal.far else angle * goal.distance
+
+    def border(self, goal: Goal) -> float:
+        """Border of a target that its interior is without, mm or degrees: both sides of the blur, within BORDERS."""
+        least, most = (part * min(goal.size) for part in BORDERS)
+        return min(max(least, 2.0 * self.blur(goal)), most)
 
     @property
     def uncoated_limit(self) -> float:

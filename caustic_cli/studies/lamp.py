@@ -27,8 +27,9 @@ from caustic_cli.scene.lamp import Goal, Lamp
 
 #: Rays of an evaluation.
 RAYS = STANDARD.final_rays
-#: Part of the smaller side of the target that is left out along its edges for the error of the interior.
-BORDER = 0.025
+#: The edge of the light is seen in a strip of this half width, degrees, about the vertical plane, in steps of latitude; and where
+#: the intensity beneath it is taken.
+STRIP, STEP, BELOW = 2.5, 0.1, 1.0
 #: A pixel of a picture without shades counts as lit entirely if it has more than this part of the greatest density.
 LIT = 0.999
 
@@ -37,7 +38,8 @@ class LampImage(NamedTuple):
     """Light on the target, fractions of that emitted.
 
     image: (n_x, n_y), on given pixels; coarse: on fewer of them, for their least value; halves: the image of either half of the
-    rays; lost: by cause; rays: their number.
+    rays; lost: by cause; rays: their number; rise: in the far field that within STRIP of the vertical plane, by latitude from -90
+    to 90 degrees in steps of STEP, of zeros on a screen.
     """
 
     image: np.ndarray
@@ -45,6 +47,7 @@ class LampImage(NamedTuple):
     halves: tuple[np.ndarray, np.ndarray]
     lost: dict[str, float]
     rays: int
+    rise: np.ndarray
 
 
 def traced(lamp: Lamp, field: PolarField, values: Tensor, rays: int, seed: int) -> Iterator[tuple[int, LampLight]]:
@@ -69,7 +72,7 @@ def lamp_image(
     """Trace a lamp with about `rays` independent rays, each counted on the pixel where it lands; also: takes their light, too."""
     screens, splat = [Screen(goal.size, resolution=n) for n in (pixels, coarse)], backend_for("cpu").splat
     halves, fewer = torch.zeros(2, *pixels, dtype=torch.float64), torch.zeros(coarse, dtype=torch.float64)
-    lost, count = dict.fromkeys((*LOSSES, "elsewhere"), 0.0), 0
+    lost, count, rise = dict.fromkeys((*LOSSES, "elsewhere"), 0.0), 0, torch.zeros(round(180.0 / STEP), dtype=torch.float64)
     for half, light in traced(lamp, field, values, rays, seed):
         also(light)
         x, y, ahead = land(goal, light)
@@ -77,12 +80,40 @@ def lamp_image(
         image, outside = splat(x, y, arriving, screens[0], Filter())
         halves[half] += image
         fewer += 0.5 * splat(x, y, arriving, screens[1], Filter())[0]
+        if goal.far:
+            near = torch.where(x.abs() <= STRIP, 0.5 * arriving, torch.zeros_like(x))
+            rise += torch.bincount(((y + 90.0) / STEP).long(), near, len(rise))
         for cause, power in light.lost.items():
             lost[cause] += 0.5 * float(power.sum())
         lost["elsewhere"] += 0.5 * float(outside + (light.power - arriving).sum())
         count += len(light.power)
     one, other = halves.numpy()
-    return LampImage(0.5 * (one + other), fewer.numpy(), (one, other), lost, count)
+    return LampImage(0.5 * (one + other), fewer.numpy(), (one, other), lost, count, rise.numpy())
+
+
+def cut_off(rise: np.ndarray) -> float | None:
+    """Angle, degrees, over which the intensity falls upwards from 90 % to 10 % of that below its uppermost steep edge; None without
+    light there.
+
+    rise: power by latitude, as of `LampImage`.  The edge is where it falls to half of its maximum; the intensity below it is the
+    mean from BELOW to twice as far beneath, and an edge wider than that appears narrower.
+    """
+    latitude = (np.arange(len(rise)) + 0.5) * STEP - 90.0
+    intensity = rise / np.cos(np.radians(latitude))
+    if not intensity.any():
+        return None
+    edge = int(np.flatnonzero(intensity >= 0.5 * intensity.max())[-1])
+    reach = round(BELOW / STEP)
+    level = float(intensity[max(0, edge - 2 * reach) : max(1, edge - reach)].mean())
+    if not level > 0:
+        return None
+
+    def last(part: float) -> float:
+        k = int(np.flatnonzero(intensity >= part * level)[-1])
+        above = intensity[k + 1] if k + 1 < len(intensity) else 0.0
+        return float(latitude[k] + STEP * (intensity[k] - part * level) / (intensity[k] - above))
+
+    return last(0.1) - last(0.9)
 
 
 def relative_rms(
@@ -125,16 +156,17 @@ def lamp_figures(
 
     Returns:
         the image, and of_source: light on the target; relative_rms: over all pixels of the picture; interior_rms: the same less a
-        border of BORDER; noise and interior_noise: of either; uniformity: least over mean illuminance (intensity in the far field)
-        on the coarse pixels within that border, None of a shaded picture; uncoated_limit; lost: by cause, with of_source of sum 1;
-        least_wall and greatest_radius, mm; pixels; rays.
+        border, mm or degrees, see `Lamp.border`; noise and interior_noise: of either; uniformity: least over mean illuminance
+        (intensity in the far field) on the coarse pixels within that border, None of a shaded picture; uncoated_limit; lost: by
+        cause, with of_source of sum 1; in the far field cut_off, degrees, see there; least_wall and greatest_radius, mm; pixels;
+        rays.
     """
     pixels, fewer = ((t.shape[0], t.shape[1]) for t in (target, coarse))
     found = lamp_image(lamp, goal, field, values, pixels, fewer, rays, seed, also)
-    shares = goal.shares(pixels)
+    shares, border = goal.shares(pixels), lamp.border(goal)
     whole = relative_rms(found.halves, target, _compared(target, goal, shaded, 0.0), shares)
-    interior = relative_rms(found.halves, target, _compared(target, goal, shaded, BORDER), shares)
-    uniformity = None if shaded else _least_over_mean(found.coarse, coarse, _compared(coarse, goal, False, BORDER))
+    interior = relative_rms(found.halves, target, _compared(target, goal, shaded, border), shares)
+    uniformity = None if shaded else _least_over_mean(found.coarse, coarse, _compared(coarse, goal, False, border))
     return found, {
         "of_source": float(found.image.sum()),
         "relative_rms": whole[0],
@@ -142,8 +174,10 @@ def lamp_figures(
         "interior_rms": interior[0],
         "interior_noise": interior[1],
         "uniformity": uniformity,
+        "border": lamp.border(goal),
         "uncoated_limit": lamp.uncoated_limit,
         "lost": found.lost,
+        **({"cut_off": cut_off(found.rise)} if goal.far else {}),
         "least_wall": least_wall(lamp, field, values),
         "greatest_radius": field.extent(sides(values)[1])[1],
         "pixels": list(pixels),
@@ -152,10 +186,10 @@ def lamp_figures(
 
 
 def _compared(target: np.ndarray, goal: Goal, shaded: bool, border: float) -> np.ndarray:
-    """Pixels of the picture, see `lamp_figures`, less a border, a fraction of the smaller side of the target."""
+    """Pixels of the picture, see `lamp_figures`, less a border, mm or degrees."""
     density = target / goal.shares((target.shape[0], target.shape[1]))
     lit = density > (0.0 if shaded else LIT * density.max())
-    reach = [round(border * min(goal.size) / s * n) for s, n in zip(goal.size, target.shape, strict=True)]
+    reach = [round(border / s * n) for s, n in zip(goal.size, target.shape, strict=True)]
     return minimum_filter(lit, [2 * r + 1 for r in reach], mode="constant", cval=False)
 
 

@@ -74,8 +74,9 @@ def density(goal: Goal, image: np.ndarray) -> np.ndarray:
 
 def _extent(goal: Goal) -> tuple[float, float, float, float]:
     """Of a target, in degrees or metres."""
-    half = [0.5 * s * (1.0 if goal.far else 1e-3) for s in goal.size]
-    return -half[0], half[0], -half[1], half[1]
+    unit = 1.0 if goal.far else 1e-3
+    (left, right), (low, high) = ((unit * (m - 0.5 * s), unit * (m + 0.5 * s)) for m, s in zip(goal.shift, goal.size, strict=True))
+    return left, right, low, high
 
 
 def _labelled(axis: Axes, goal: Goal, title: str) -> None:

@@ -44,8 +44,9 @@ def verify_lamp(
     image, squares = np.zeros((2, *pixels))
     for start in range(0, rays, CHUNK):
         *points, weight = follow(mi, world, shapes, SURFACES, *_emitted(lamp.chip, min(CHUNK, rays - start), rng))
+        x, y = (p - middle for p, middle in zip(points, seen.shift, strict=False))
         for total, power in ((image, weight), (squares, weight**2)):
-            total += np.histogram2d(*points[:2], pixels, [(-0.5 * s, 0.5 * s) for s in seen.size], weights=power)[0]
+            total += np.histogram2d(x, y, pixels, [(-0.5 * s, 0.5 * s) for s in seen.size], weights=power)[0]
     seeds = [stream(seed, f"verify {k}") for k in range(BATCHES)]
     renders = np.array(
         [lamp_image(lamp, seen, field, values, pixels, rays=max(2, rays // BATCHES), seed=own).image for own in seeds]

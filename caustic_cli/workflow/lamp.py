@@ -26,6 +26,7 @@ from caustic_cli.export.lamp_mitsuba import FINE, plane_of, write_lamp_mitsuba
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, stages_of, wanted
+from caustic_cli.inverse.lamp_limits import chip_limits
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
 from caustic_cli.loading import OnDemand
@@ -110,10 +111,8 @@ class LampDesign:
         """The light by independent rays; rays: None for those of the evaluation of a design."""
         effort = current_effort()
         rays = rays or effort.final_rays
-        stages = effort.lamp_stages
-        fine, coarse = (
-            wanted(self.goal, self.picture, pixels_of(self.goal, count)).numpy() for count in (4 * stages[-1][0], stages[1][0])
-        )
+        counts = effort.lamp_pixels, effort.lamp_pixels // 16
+        fine, coarse = (wanted(self.goal, self.picture, pixels_of(self.goal, count)).numpy() for count in counts)
         shaded = len(np.unique(self.picture[self.picture > 0])) > 1
         intensities = IntensitySum()
         how: dict[str, Any] = {"shaded": shaded, "rays": rays, "seed": seed, "also": intensities.add}
@@ -201,23 +200,21 @@ def resume(project: Project, say: Reporter) -> LampDesign:
     if saved.results:
         say.say(f"{project.path}: is finished, so there is nothing to do; ⟨force⟩ designs it anew")
         return LampDesign.of(project)
-    if saved.state.heights.shape[-2:] != field_of(current_effort()).shape:
-        raise project.error("holds a lamp of another effort in its checkpoint: design it again")
     with project.hold:
         assert project.path is not None
         project.hold.enter_context(directory.locked(project.path))
-        return _run(project, saved.state, True, say)
+        return _run(project, saved, True, say)
 
 
-def _run(project: Project, before: State | None, force: bool, say: Reporter) -> LampDesign:
+def _run(project: Project, before: Checkpoint | None, force: bool, say: Reporter) -> LampDesign:
     """Design a lamp after the stages that were done `before`, and evaluate it; the checkpoint is written after each stage."""
     began, s, effort = Start.now(), project.settings, current_effort()
-    lamp, goal, picture, field = lamp_of(s), goal_of(s), picture_of(project), field_of(effort)
-    for words in notes(lamp, goal):
+    lamp, goal, picture = lamp_of(s), goal_of(s), picture_of(project)
+    for words in (*notes(lamp, goal), *chip_limits(lamp, goal, picture, effort.bound_steps)):
         say.say(words)
     stages = stages_of(lamp, effort)
     last, total = len(stages), sum(iterations for _, (_, _, iterations, _) in stages)
-    state = State(torch.empty(0)) if before is None else before
+    state = State(torch.empty(0)) if before is None else before.state
     history, earlier = list(state.history), state.seconds
     made = {"caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "seed": s.design.seed}
 
@@ -225,7 +222,7 @@ def _run(project: Project, before: State | None, force: bool, say: Reporter) -> 
         history.append((len(history) + 1, stage, loss, 0.0, earlier + began.seconds))
         show(f"stage {stage + 1}/{last}", f"loss {loss:.5f}", len(history), total)
 
-    def save(done: int, values: Tensor, figures: dict[str, Any] | None = None) -> None:
+    def save(done: int, field: PolarField, values: Tensor, figures: dict[str, Any] | None = None) -> None:
         nonlocal before
         if project.path is None:
             return
@@ -236,14 +233,14 @@ def _run(project: Project, before: State | None, force: bool, say: Reporter) -> 
             directory.create(project, force, saved)
         else:
             checkpoint.save(project.path / CHECKPOINT, saved)
-        before = state
+        before = saved
 
     with project.hold:
         with say.progress(total) as show, one_thread():  # the tensors of a chunk of rays are too small for more threads
-            begun = None if before is None else (before.stage, before.heights)
-            how: dict[str, Any] = {"effort": effort, "seed": s.design.seed, "begun": begun}
+            begun = None if before is None else (before.state.stage, PolarField(before.spaces), before.state.heights)
+            how: dict[str, Any] = {"effort": effort, "begun": begun}
             values = design_lamp(lamp, goal, picture, **how, on_iteration=told, on_stage=save)
-        found = LampDesign(project, lamp, goal, field, values, picture, {})
+        found = LampDesign(project, lamp, goal, field_of(effort), values, picture, {})
         evaluation = found.evaluated(None, s.design.seed)
         seconds = earlier + began.seconds
         figures = evaluation.figures | {"iterations": len(history), "seconds": seconds, "reason": "iterations"}
@@ -252,7 +249,7 @@ def _run(project: Project, before: State | None, force: bool, say: Reporter) -> 
             _write_image(project.path / RENDER, evaluation.image, project, goal)
             if effort.report:
                 found.write_report(project.path / REPORT, evaluation)
-        save(last, values, figures)
+        save(last, found.field, values, figures)
     return replace(found, figures=figures)
 
 
@@ -262,11 +259,10 @@ def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
     if lamp.surfaces == 2:
         return
     most = math.degrees(math.acos(1.0 / lamp.index))
-    sides = [math.radians(s / 2) if goal.far else math.atan(s / 2 / goal.distance) for s in goal.size]
-    if (needed := 90.0 - math.degrees(min(sides))) > most:
+    if (needed := 90.0 - goal.nearest_edge) > most:
         yield (
             f"one surface of index {lamp.index:.4g} turns light by at most {most:.1f} degrees, and that of the rim would have to be"
-            f" turned by {needed:.0f} to reach the nearer edges of the picture: part of it falls beside"
+            f" turned by {needed:.0f} to reach the nearest edge of the picture: part of it falls beside"
         )
 
 
@@ -357,7 +353,8 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("on target", f"{figures['of_source']:.2%} of all light; uncoated limit {figures['uncoated_limit']:.2%}"),
         (
             "relative RMS error",
-            f"{number('interior_rms', '.4f')}, noise {number('interior_noise', '.2g')}; with the outer 2.5 %"
+            f"{number('interior_rms', '.4f')}, noise {number('interior_noise', '.2g')}; with the outer"
+            f" {number('border', '.4g')} {'degrees' if 'peak_candela' in figures else 'mm'}"
             f" {number('relative_rms', '.4f')}, noise {number('noise', '.2g')}",
         ),
         ("least over mean", number("uniformity", ".3f")),
@@ -367,6 +364,8 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
     found.append(
         ("intensity", f"{figures['peak_candela']:.0f} cd per 1000 lm of the chip; beam angle {beam} degrees, field angle {field}")
     )
+    if figures.get("cut_off") is not None:
+        found.append(("upper edge", f"{figures['cut_off']:.2f} degrees from 90 % to 10 % of the intensity beneath it"))
     found += [
         ("least wall", f"{figures['least_wall']:.3g} mm; greatest radius {figures['greatest_radius']:.4g} mm"),
         ("rays", f"{figures['rays']:,} on {width} x {height} pixels"),

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -123,6 +124,21 @@ class PolarField:
         """Derivatives of r of these orders by u and v at points (N,): (N,) float64 each; linear in the control values."""
         return self.net.at(values, u, v, orders)
 
+    @cached_property
+    def _slope_nets(self) -> tuple[HeightField, HeightField]:
+        """r_u and r_v, height fields over the square of one degree less along u, and along v."""
+        (u, v), square = self.spaces, (1.0, 1.0)
+        return HeightField((u.derivative, v), square), HeightField((u, v.derivative), square)
+
+    def second(self, values: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """r_uu, r_uv, r_vv at points (N,): first derivatives of the splines r_u and r_v."""
+        if min(space.degree for space in self.spaces) == 1:
+            ruu, ruv, rvv = self.at(values, u, v, SECOND)
+            return ruu, ruv, rvv
+        by_u, by_v = (0.5 * space.differences(values, axis) for axis, space in enumerate(self.spaces))
+        _, ruu, ruv = self._slope_nets[0].evaluate(by_u, u, v)
+        return ruu, ruv, self._slope_nets[1].evaluate(by_v, u, v)[2]
+
     def points(self, values: Tensor, u: Tensor, v: Tensor) -> Vectors:
         """P at (u, v), mm."""
         (r,) = self.at(values, u, v, [(0, 0)])
@@ -173,7 +189,7 @@ class PolarField:
             o, d = (ox.detach(), oy.detach(), oz.detach()), (dx.detach(), dy.detach(), dz.detach())
             t, valid = self._root(net, o, d)
             at = stereographic(*(s + t * c for s, c in zip(o, d, strict=True)))
-            second = self.at(net, *at, SECOND) if differentiable else None
+            second = self.second(net, *at) if differentiable else None
         here = self.net.evaluate(values, *at)
         # One Newton step with the derivatives of the root gives t its derivatives by the implicit function theorem; r near the root
         # is a Taylor polynomial, exact there with its first derivatives by points.
