@@ -1,6 +1,7 @@
 """Files of the solid of a lamp: STEP, meshes, its foot, and its scene for Mitsuba with the comparison."""
 
 import ast
+import json
 import math
 import re
 import sys
@@ -15,14 +16,21 @@ import torch
 from scipy.interpolate import BSpline
 from test_roundtrip import arguments, read_step
 
+from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import flange_radius, lamp_mesh, lamp_parts
 from caustic_cli.export.lamp_mitsuba import FINE, companions, plane_of, write_lamp_mitsuba
 from caustic_cli.export.lamp_step import nurbs, write_lamp_step
-from caustic_cli.optics.lamp import ChipRays, land, through
-from caustic_cli.optics.surfaces.polarfield import PolarField
+from caustic_cli.inverse.lamp import pixels_of, wanted
+from caustic_cli.inverse.refractor_transport import source_directions
+from caustic_cli.optics.lamp import ChipRays, PointGrid, chip_grids, emissions, land, through
+from caustic_cli.optics.surfaces.polarfield import PolarField, direction_of
+from caustic_cli.project.project import Project
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
+from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.studies import lamp_verify
+from caustic_cli.studies.lamp import lamp_figures
+from caustic_cli.workflow.lamp import LampDesign
 
 FIELD = PolarField.uniform((12, 9), (3, 4))
 
@@ -282,3 +290,72 @@ def test_the_scene_holds_closed_glass_and_a_chip_of_its_light(tmp_path):
             a, b, c = points[faces].transpose(1, 0, 2)
             facing = np.cross(b - a, c - a)
             assert ((facing * normals[faces[:, 0]]).sum(1) > 0.9 * np.linalg.norm(facing, axis=1)).all()
+
+
+# Tabulated chips
+
+NARROW = Distribution((0.0, 20.0, 50.0, 90.0), (2.0, 1.8, 0.4, 0.0))
+
+
+def mean_cosine(intensity):
+    """Mean of cos(theta) over the light of a distribution, by quadrature."""
+    theta = np.linspace(0.0, 0.5 * math.pi, 20_001)
+    weight = intensity.relative(theta) * np.sin(theta)
+    return float((weight * np.cos(theta)).sum() / weight.sum())
+
+
+@pytest.mark.parametrize("size", [(0.0, 0.0), (2.0, 1.0)])
+def test_the_light_of_a_tabulated_chip_has_its_intensity(size):
+    chip = Chip("rectangle" if size[0] else "point", size, NARROW)
+    wanted = mean_cosine(NARROW)
+    rays = [emissions(chip, 40_000, 1), chip_grids(chip, 4, 40_000) if size[0] else []]
+    for parts in map(list, rays):
+        if parts:
+            assert sum(float((part.power * part.direction[2]).sum()) for part in parts) == pytest.approx(wanted, abs=3e-3)
+            assert sum(float(part.power.sum()) for part in parts) == pytest.approx(1.0)
+            norm = torch.stack(parts[0].direction).norm(dim=0)
+            torch.testing.assert_close(norm, torch.ones_like(norm))
+    grids = PointGrid.of(FIELD, 40_000, chip.centre)
+    cosine = sum(float((grid.power * direction_of(grid.u, grid.v)[2]).sum()) for grid in grids)
+    assert cosine == pytest.approx(wanted, abs=1e-3)
+    directions, power = source_directions(60, chip)
+    assert float((power * directions[:, 2]).sum()) == pytest.approx(wanted, abs=3e-3)
+    origin, direction = lamp_verify._emitted(chip, 40_000, np.random.default_rng(1))
+    assert direction[2].mean() == pytest.approx(wanted, abs=5e-3) and origin.shape == (3, 40_000)
+
+
+def test_a_table_of_lamberts_law_is_no_table():
+    angles = np.linspace(0.0, 90.0, 901)
+    table = Chip(intensity=Distribution(tuple(angles), tuple(np.cos(np.radians(angles)).clip(0.0))))
+    for one, other in zip(emissions(Chip(), 2000, 1), emissions(table, 2000, 1), strict=True):
+        for a, b in zip(one.direction, other.direction, strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=1e-3)
+
+
+def test_a_tabulated_chip_is_designed_for_and_kept(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    Path("led.csv").write_text("angle,intensity\n0,2\n20,1.8\n50,0.4\n90,0\n")
+    given = ["--lamp", "15", "--angles", "100x60", "--quiet", "--json"]
+    found = {}
+    for name, more in (("table", ["--chip-intensity", "led.csv"]), ("law", [])):
+        assert cli.run(["design", "uniform", *given, *more, "-o", name]) == 0
+        found[name] = json.loads(capfd.readouterr().out)
+    assert Path("table/chip.csv").read_bytes() == Path("led.csv").read_bytes()
+    Path("led.csv").unlink()
+    assert cli.run(["render", "table", "--rays", "40000", "-o", "a.png", "--json", "--quiet"]) == 0
+    seen = json.loads(capfd.readouterr().out)
+    assert seen["of_source"] == pytest.approx(found["table"]["of_source"], abs=0.01) and found["law"]["of_source"] > 0.8
+    lamp = LampDesign.of(Project.open("table"))
+    assert lamp.lamp.chip.intensity == NARROW
+    one, other = (
+        lamp_figures(replace(lamp.lamp, chip=chip), lamp.goal, lamp.field, lamp.values, *targets(lamp.goal), rays=40_000)[1]
+        for chip in (lamp.lamp.chip, Chip())
+    )
+    assert one["interior_rms"] < 0.7 * other["interior_rms"]  # the lens is made for its chip
+    assert cli.run(["export", "table", "--format", "mitsuba"]) == 2
+    assert "obey Lambert's law" in capfd.readouterr().err
+
+
+def targets(goal):
+    """A uniform target on few pixels, twice."""
+    return [wanted(goal, np.ones((2, 2)), pixels_of(goal, count)).numpy() for count in (600, 100)]

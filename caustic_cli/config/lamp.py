@@ -117,7 +117,8 @@ def lamp_of(settings: Settings) -> Lamp:
     """
     s = settings.lamp
     assert s is not None and s.radius is not None and s.inner is not None
-    chip = Chip("point") if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip)
+    table = getattr(s.intensity, "content", None)
+    chip = Chip("point", intensity=table) if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip, table)
     return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall, s.surfaces, s.base, s.flange)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import SAMPLES, lamp_parts
 from caustic_cli.export.mitsuba import BLACK, beside, camera, dielectric, file_of, screen_shape
 from caustic_cli.export.ply import write_mesh
@@ -57,8 +58,10 @@ def write_lamp_mitsuba(
     """Write the meshes and then the scene; pixels: of the camera; samples: as of `lamp_mesh`; dark: without an emitter.
 
     Raises:
-        InputError: as `lamp_mesh`.
+        InputError: as `lamp_mesh`, or the chip is not Lambertian, as emitters of Mitsuba are.
     """
+    if lamp.chip.intensity is not None and not dark:
+        raise InputError("⟨format⟩ mitsuba holds chips that obey Lambert's law, and this one has the table ⟨lamp.intensity⟩")
     parts = lamp_parts(lamp, field, values, samples)
     for name, (points, faces, normals) in zip(PARTS, parts, strict=True):
         write_mesh(beside(path, name), points, faces, normals)

@@ -30,7 +30,7 @@ from caustic_cli.optics.lamp import ChipRays, PointGrid, chip_grids, land, least
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene import Screen
-from caustic_cli.scene.lamp import Chip, Goal, Lamp
+from caustic_cli.scene.lamp import Goal, Lamp
 
 #: Squared cosine of the angle of exit below which a ray is near total reflection.
 MARGIN = 0.005
@@ -94,7 +94,7 @@ class LampObjective:
         self.goal, self.weight = goal, weight
         point = lamp.chip.shape == "point"
         self.rays: Sequence[PointGrid | ChipRays]
-        self.rays = PointGrid.of(field, rays) if point else list(chip_grids(lamp.chip, CHIP_POINTS, rays))
+        self.rays = PointGrid.of(field, rays, lamp.chip) if point else list(chip_grids(lamp.chip, CHIP_POINTS, rays))
         self.through = partial(through_point if point else through, lamp, field)
         self.screen = Screen(goal.size, resolution=(target.shape[0], target.shape[1])).grown((APRON, APRON))
         smooth = FILTER.smooth(torch.nn.functional.pad(target.double(), (APRON,) * 4))
@@ -189,7 +189,7 @@ def initial_lamp(lamp: Lamp, goal: Goal, field: PolarField, picture: np.ndarray,
     pixels = pixels_of(goal, round(0.25 * math.pi * cells * cells))
     power = wanted(goal, picture, pixels).reshape(-1)
     lit = power > 0
-    return transported(field, directions_of(goal, pixels)[lit], power[lit], lamp.index, lamp.radius, cells)
+    return transported(field, directions_of(goal, pixels)[lit], power[lit], lamp.index, lamp.radius, cells, lamp.chip)
 
 
 def field_of(effort: Effort, pixels: int | None = None) -> PolarField:
@@ -208,7 +208,7 @@ def refined(field: PolarField, values: Tensor, finer: PolarField) -> Tensor:
 
 def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Lamp, tuple[int, int, int, float]]]:
     """The stages of a design, each with the lamp that it refines: the lamp itself, with one surface or with a point as its chip."""
-    point = replace(lamp, chip=Chip())
+    point = replace(lamp, chip=lamp.chip.centre)
     if lamp.surfaces == 2:
         found = [(replace(point, surfaces=1), effort.lamp_stages[0]), *((point, stage) for stage in effort.two_stages)]
     else:

@@ -26,9 +26,10 @@ PIXELS = 3000
 
 
 def etendue_limit(lamp: Lamp, goal: Goal) -> float:
-    """Largest fraction of the chip's light that its lens can send to the target, by etendue; inf for a point."""
+    """Largest fraction of the chip's light that its lens can send to the target, by etendue; inf for a point, and for one
+    that obeys another law than Lambert's."""
     width, height = lamp.chip.size
-    if not width * height > 0:
+    if not width * height > 0 or lamp.chip.intensity is not None:
         return math.inf
     area = width * height * (1.0 if lamp.chip.shape == "rectangle" else 0.25 * math.pi)
     pixels = pixels_of(goal, PIXELS)

@@ -38,6 +38,7 @@ from caustic_cli.optics.surfaces.polarfield import (
 )
 from caustic_cli.optics.tolerances import LEAST_COSINE
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
+from caustic_cli.scene.sources.distribution import Distribution
 
 #: Causes for which light is lost, in the order of their occurrence.
 LOSSES = ("inner_fresnel", "missed", "total_internal_reflection", "outer_fresnel")
@@ -51,6 +52,7 @@ CHUNK = 1 << 17
 DENSER, CORNERS = 1.0, 1.1
 #: Steps of an additive sequence that covers the unit square evenly (Roberts 2018, from the plastic number).
 LATTICE = (0.7548776662466927, 0.5698402909980532)
+LAMBERTIAN = Chip()
 _DEGREE = 180.0 / math.pi
 
 
@@ -106,8 +108,18 @@ def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
             s, t, k, m = numbers("sobol", (1, 1), seed, 4, start, stop)
             x, y = on_chip(chip, k, m)
         dx, dy = concentric(s, t)
+        if chip.intensity is not None:
+            dx, dy = _tabulated(chip.intensity, dx, dy)
         dz = (1.0 - dx * dx - dy * dy).clamp_min(0.0).sqrt()
         yield ChipRays((x, y, torch.zeros_like(x)), (dx, dy, dz), torch.full_like(dx, 1.0 / total))
+
+
+def _tabulated(intensity: Distribution, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Components of directions, of equal flux for equal area of the unit disc."""
+    fraction = x * x + y * y
+    sine = torch.from_numpy(np.sin(intensity.angle_of(fraction.numpy(), 0.5 * math.pi)))
+    scale = sine / fraction.sqrt().clamp_min(1e-300)
+    return scale * x, scale * y
 
 
 def chip_grids(chip: Chip, points: int, count: int) -> Iterator[ChipRays]:
@@ -130,7 +142,7 @@ def chip_grids(chip: Chip, points: int, count: int) -> Iterator[ChipRays]:
         u, v = (c.reshape(-1) for c in torch.broadcast_tensors(u[:, :, None], v[:, None, :]))
         lit = u * u + v * v < 1.0
         at, u, v = places.repeat_interleave(side * side)[lit], u[lit], v[lit]
-        parts.append(ChipRays((x[at], y[at], torch.zeros_like(u)), direction_of(u, v), lambertian(u, v)))
+        parts.append(ChipRays((x[at], y[at], torch.zeros_like(u)), direction_of(u, v), emitted(chip, u, v)))
         total += float(parts[-1].power.sum())
     return (part._replace(power=part.power / total) for part in parts)
 
@@ -139,6 +151,14 @@ def lambertian(u: Tensor, v: Tensor) -> Tensor:
     """Light of a Lambertian emitter per area of (u, v), up to a factor, see the module; for u^2 + v^2 <= 1."""
     rho2 = u * u + v * v
     return (1.0 - rho2) / (1.0 + rho2) ** 3
+
+
+def emitted(chip: Chip, u: Tensor, v: Tensor) -> Tensor:
+    """The same of the points of a chip."""
+    if chip.intensity is None:
+        return lambertian(u, v)
+    rho2 = u * u + v * v
+    return torch.from_numpy(chip.intensity.relative(2.0 * np.arctan(rho2.sqrt().numpy()))) / (1.0 + rho2) ** 2
 
 
 class PointGrid:
@@ -150,7 +170,7 @@ class PointGrid:
     u, v: (N,) coordinates of the directions; power: (N,), of sum 1 over all rows.
     """
 
-    def __init__(self, field: PolarField, sample: Sample):
+    def __init__(self, field: PolarField, sample: Sample, chip: Chip):
         s, t = (2.0 * c - 1.0 for c in (sample.u, sample.v))
         u, v = (torch.tan(DENSER * c) / math.tan(DENSER) for c in (s, t))
         sample = replace(sample, u=0.5 * (u + 1.0), v=0.5 * (v + 1.0))
@@ -158,14 +178,14 @@ class PointGrid:
         u, v = torch.meshgrid(u, v, indexing="ij")
         self.lit = (u * u + v * v < 1.0).reshape(-1).nonzero()[:, 0]
         self.u, self.v = u.reshape(-1)[self.lit], v.reshape(-1)[self.lit]
-        self.power = lambertian(self.u, self.v) * stretch[self.lit]
+        self.power = emitted(chip, self.u, self.v) * stretch[self.lit]
         self._surface = field.net.prepare(sample, torch.float64)
 
     @classmethod
-    def of(cls, field: PolarField, count: int) -> list[PointGrid]:
-        """About `count` rays, CHUNK at a time: small tensors stay in the cache of the processor."""
+    def of(cls, field: PolarField, count: int, chip: Chip = LAMBERTIAN) -> list[PointGrid]:
+        """About `count` rays of the centre of a chip, CHUNK at a time: small tensors stay in the cache of the processor."""
         sampler = Sampler.of_size("grid", max(1, round(count * CORNERS)))
-        grids = [cls(field, sample) for sample in sampler.chunks(CHUNK)]
+        grids = [cls(field, sample, chip) for sample in sampler.chunks(CHUNK)]
         total = sum(float(grid.power.sum()) for grid in grids)
         for grid in grids:
             grid.power /= total

@@ -63,7 +63,7 @@ def new_project(
         said["source"] = colours.filled(said.get("source", {}), picture)
     full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
     if full.lamp is not None:
-        full = _with_picture(full, picture)
+        full = attachments.named_in_project(_with_picture(full, picture))
         return Project(out, full, picture, uptodate.digest(full, picture)), said
     for key in ("index_range", "index_control", "index_layers"):
         if f"lens.{key}" in given and full.lens.gradient != "free":

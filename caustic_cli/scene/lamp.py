@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.scene.sources.distribution import Distribution
 
 SHAPES = ("point", "disc", "rectangle")
 #: Widest target in the far field, degrees, along x and y: a lamp emits into z > 0.
@@ -25,7 +26,7 @@ OBLONG, NEAREST = 100.0, 2.0
 
 @dataclass(frozen=True)
 class Chip:
-    """A Lambertian emitter.
+    """An emitter, Lambertian unless its intensity is tabulated.
 
     Raises:
         InputError: an unknown shape, or a size that does not belong to it.
@@ -35,6 +36,8 @@ class Chip:
     shape: str = "point"
     #: Full width and height, mm; 0 for a point.
     size: tuple[float, float] = (0.0, 0.0)
+    #: Of every point of it by the angle from +z; None for Lambert's law.
+    intensity: Distribution | None = None
 
     def __post_init__(self):
         if self.shape not in SHAPES:
@@ -45,6 +48,11 @@ class Chip:
             raise InputError(
                 f"a {self.shape} has {'no size' if self.shape == 'point' else 'two sizes above 0 mm'}, got {self.size}"
             )
+
+    @property
+    def centre(self) -> Chip:
+        """A point that emits as the chip does."""
+        return Chip(intensity=self.intensity)
 
     @property
     def reach(self) -> float:

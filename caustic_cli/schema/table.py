@@ -297,6 +297,9 @@ class LampSettings(Section):
             " that a small chip approaches", option=Option("--chip", "W[xH]"))
     shape: str = setting("shape of the chip: rectangle or disc", choices=("rectangle", "disc"), default="rectangle", written=False,
             option=Option("--chip-shape", "rectangle|disc"))
+    intensity: str | None = setting("angular distribution of the chip instead of Lambert's law: a .csv of degrees from +z and"
+            " relative intensity, or a photometric file (.ies, .ldt) symmetric about its axis", derived="Lambert's law",
+            option=Option("--chip-intensity", "FILE"), file="chip")
     angles: Pair | None = setting("full width and height of the picture in the far field, its values being intensities: longitude"
             " about the vertical and latitude (type A photometry)", "degrees", 0.0, 178.0, above=True, derived="a picture on a"
             " screen", option=Option("--angles", "W[xH]"))

@@ -58,8 +58,15 @@ def verify_lamp(
 
 
 def _emitted(chip: Chip, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Origins (3, N) mm on a chip and directions (3, N) by Lambert's law: by polar angles, independent of `optics.lamp`."""
+    """Origins (3, N) mm on a chip and directions (3, N): by polar angles, independent of `optics.lamp`; of a table by rejection."""
     sine, turn = np.sqrt(rng.uniform(size=count)), 2.0 * math.pi * rng.uniform(size=count)
+    if chip.intensity is not None:
+        sine, most = np.empty(0), max(chip.intensity.values)
+        while len(sine) < count:
+            cosine = rng.uniform(size=count)  # uniform in solid angle
+            kept = rng.uniform(size=count) * most < chip.intensity.relative(np.arccos(cosine))
+            sine = np.concatenate([sine, np.sqrt(1.0 - cosine[kept] ** 2)])
+        sine = sine[:count]
     direction = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.sqrt(1.0 - sine * sine)])
     x, y = rng.uniform(-1.0, 1.0, (2, count))
     if chip.shape == "disc":
