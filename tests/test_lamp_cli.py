@@ -298,10 +298,10 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
         (["export", "-o", "a.dat"], "a --format is needed"),
         (["export", "--format", "heightmap"], "a lamp's surface is none"),
         (["export", "--format", "zemax"], "step for programs of optical design"),
-        (["export", "--format", "step", "--samples", "9"], "--samples belongs to stl, ply, obj"),
+        (["export", "--format", "step", "--samples", "9"], "--samples belongs to stl, ply, obj, 3mf"),
         (["export", "--format", "gcode"], "a lamp's surface is none"),
         (["export", "--format", "stl", "--mould"], "--mould is for a lens before its light"),
-        (["export", "--format", "ies", "--samples", "9"], "--samples belongs to stl, ply, obj"),
+        (["export", "--format", "ies", "--samples", "9"], "--samples belongs to stl, ply, obj, 3mf"),
         (["export", "--format", "stl", "--samples", "1"], "2 to 4000 rings"),
         (["export", "--format", "stl,ply", "-o", "a.stl"], "--out names one file"),
         (["gradmap", "--control", "3,3"], "makes a lamp"),
@@ -350,7 +350,7 @@ def test_the_mesh_is_closed_oriented_and_has_the_volume_of_its_surfaces():
     assert vertices[:, 2].min() == 0.0 and vertices[:, 2].max() == pytest.approx(10.0)
 
 
-@pytest.mark.parametrize("format", ["stl", "ply", "obj"])
+@pytest.mark.parametrize("format", ["stl", "ply", "obj", "3mf"])
 def test_solids_are_written_and_repeated(format, road, capfd):
     figures = figures_of(capfd, "export", str(road), "--format", format, "--samples", "20x60")
     path = Path(figures["file"])

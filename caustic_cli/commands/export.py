@@ -45,7 +45,7 @@ class ExportOptions(options.OfDesign, options.Debugging):
             "--format",
             metavar="NAME[,NAME...]",
             help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items())
-            + "; of a lamp step, stl, ply, obj, mitsuba, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's"
+            + "; of a lamp step, stl, ply, obj, 3mf, mitsuba, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's"
             " suffix says; lighttools]",
         ),
     ] = None
@@ -65,9 +65,9 @@ class ExportOptions(options.OfDesign, options.Debugging):
         float | None,
         typer.Option(
             metavar="MM",
-            help="Largest deviation from the surface.  stl, ply, obj, mitsuba: of the triangles, instead of --samples; heightmap:"
-            " of bilinear interpolation; gcode: of linear moves (a hundredth of the scallops); step: of a spline with as few"
-            " knots as possible, 0 for the exact one; lighttools: 0 for exact numbers.  [default: as --samples]",
+            help="Largest deviation from the surface.  stl, ply, obj, 3mf, mitsuba: of the triangles, instead of --samples;"
+            " heightmap: of bilinear interpolation; gcode: of linear moves (a hundredth of the scallops); step: of a spline"
+            " with as few knots as possible, 0 for the exact one; lighttools: 0 for exact numbers.  [default: as --samples]",
         ),
     ] = None
     max_size: Annotated[
@@ -82,7 +82,7 @@ class ExportOptions(options.OfDesign, options.Debugging):
     mould: Annotated[
         bool,
         typer.Option(
-            "--mould", help="step, stl, ply, obj, heightmap, gcode: the negative form, oriented for machining from above."
+            "--mould", help="step, stl, ply, obj, 3mf, heightmap, gcode: the negative form, oriented for machining from above."
         ),
     ] = False
     block: Annotated[

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
-from caustic_cli.export import lamp_mitsuba, obj, ply, stl
+from caustic_cli.export import lamp_mitsuba, obj, ply, stl, threemf
 from caustic_cli.export.lamp import SAMPLES, lamp_mesh
 from caustic_cli.export.lamp_step import write_lamp_step
 from caustic_cli.inverse.lamp import pixels_of
@@ -72,6 +72,7 @@ FORMATS = {
     "stl": Format(".stl", partial(_mesh, stl.write_mesh)),
     "ply": Format(".ply", partial(_mesh, ply.write_mesh)),
     "obj": Format(".obj", partial(_mesh, obj.write_mesh)),
+    "3mf": Format(".3mf", partial(_mesh, threemf.write_mesh)),
     "mitsuba": Format(".xml", _mitsuba, companions=lamp_mitsuba.companions),
     "ies": Format(".ies", partial(_photometry, write_ies), False),
     "ldt": Format(".ldt", partial(_photometry, write_ldt), False),
