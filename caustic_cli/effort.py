@@ -112,9 +112,9 @@ class Effort:
         (24_000, 250_000, 80, 0.015),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.
-    chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_000, 400_000, 60, 0.02),)
+    chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_000, 400_000, 70, 0.01),)
     #: Spans of the spline along both axes in a stage with enough pixels; cells of the light along both axes for the transport;
-    #: pixels on which a lamp is judged.
+    #: pixels on which the lamp of a point is judged, that of a chip on a quarter of them.
     lamp_spans: int = 64
     lamp_cells: int = 44
     lamp_pixels: int = 43_200

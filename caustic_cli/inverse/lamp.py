@@ -3,7 +3,8 @@
     loss = rho^2 + w (1 - efficiency + distance beside the target + lack of margin to total reflection)
 
 rho     relative RMS error of the power on the pixels of the target and of an apron around it, the image divided by its own sum;
-        of a chip on those of the interior, since it blurs the edges
+        of a chip, which blurs the edges, those of a border and of the apron count little, and the image is divided by its sum on
+        the interior
 w       weight of the light that does not arrive, all light of the chip counting 1.  Where light is scarce, at the rim of the
         hemisphere, both terms compete: it is large at first, so that light comes onto the target, and small in the last stage
 """
@@ -36,8 +37,8 @@ from caustic_cli.scene.lamp import Goal, Lamp
 MARGIN = 0.005
 #: Dark pixels around the target on which light beside it is seen; and the filter of the image.
 APRON, FILTER = 4, Filter("cosine", (3, 3))
-#: Points of a chip along both of its axes.
-CHIP_POINTS = 4
+#: Points of a chip along both of its axes; weight of the pixels on the border that it blurs, and of the apron.
+CHIP_POINTS, BLURRED = 8, 0.01
 #: Least pixels of a stage per square of a span of the spline: finer waves than pixels show would grow unseen, and cost most of the
 #: iterations of the following stage.
 PER_SPAN = 3
@@ -45,7 +46,7 @@ PER_SPAN = 3
 DEGREE = 3
 #: Points of a grid at which limits of two surfaces hold, weight of their squares, the wall there over that to be kept, and the
 #: greatest radius over that there.
-LIMIT_POINTS, STIFF, SAFE, WITHIN = 8000, 3.0, 1.1, 1.02
+LIMIT_POINTS, STIFF, SAFE, WITHIN = 8000, 10.0, 1.1, 1.02
 #: Radius of the first inner surface, a sphere, over its least one.
 BEGIN = 4.0 / 3.0
 
@@ -100,8 +101,9 @@ class LampObjective:
         smooth = FILTER.smooth(torch.nn.functional.pad(target.double(), (APRON,) * 4))
         self.inside = torch.nn.functional.pad(torch.ones_like(target), (APRON,) * 4, value=float(point))
         self.seen = torch.ones_like(smooth) if point else self._interior(lamp, target)
-        self.target = smooth * self.seen / (smooth * self.seen).sum()
-        self.lit = float((target > 0).sum()) if point else float((self.target > 0).sum())
+        self.target = smooth / (smooth * self.seen).sum()
+        self.weights = self.seen + BLURRED * (1.0 - self.seen)
+        self.lit = float((target > 0).sum()) if point else float(((smooth > 0) & (self.seen > 0)).sum())
         self.splat = backend_for("cpu").splat
         self.limits = SurfaceLimits(lamp, field) if lamp.surfaces == 2 else None
 
@@ -115,9 +117,8 @@ class LampObjective:
     def terms(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """rho^2, efficiency, mean distance beside the target, and lack of margin."""
         image, distance, lack = (sum(part) for part in zip(*(self._see(rays, values) for rays in self.rays), strict=True))
-        seen = image * self.seen
-        residual = seen / seen.sum() - self.target
-        return (residual * residual).sum() * self.lit, (image * self.inside).sum(), distance, lack
+        residual = image / (image * self.seen).sum() - self.target
+        return (self.weights * residual * residual).sum() * self.lit, (image * self.inside).sum(), distance, lack
 
     def _see(self, rays, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Contributions of some rays to the image, to the distance beside the target and to the lack of margin."""

@@ -58,7 +58,7 @@ def chip_limits(lamp: Lamp, goal: Goal, picture: np.ndarray, most: int) -> Itera
     """Sentences for the user; none for a point."""
     if lamp.chip.shape == "point":
         return
-    blur, border = (f"{length:.3g} {goal.unit}" for length in (lamp.blur(goal), lamp.border(goal)))
+    blur, border = (f"{length:.4g} {goal.unit}" for length in (lamp.blur(goal), lamp.border(goal)))
     yield f"the chip blurs the picture by {blur} or more, and its interior is what lies {border} within the edges"
     if len(np.unique(picture[picture > 0])) > 1 and (error := least_error(lamp, goal, picture, most)) > NO_ERROR:
         yield f"behind this blur, no picture has a relative RMS error of less than {at_most(error, 3)}"

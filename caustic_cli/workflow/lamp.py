@@ -111,7 +111,8 @@ class LampDesign:
         """The light by independent rays; rays: None for those of the evaluation of a design."""
         effort = current_effort()
         rays = rays or effort.final_rays
-        counts = effort.lamp_pixels, effort.lamp_pixels // 16
+        finest = effort.lamp_pixels if self.lamp.chip.shape == "point" else effort.lamp_pixels // 4  # of what it does not blur
+        counts = finest, effort.lamp_pixels // 16
         fine, coarse = (wanted(self.goal, self.picture, pixels_of(self.goal, count)).numpy() for count in counts)
         shaded = len(np.unique(self.picture[self.picture > 0])) > 1
         intensities = IntensitySum()
