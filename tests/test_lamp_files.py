@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from rayfiles import zemax
 from scipy.interpolate import BSpline
 from test_roundtrip import arguments, read_step
 
@@ -28,6 +29,7 @@ from caustic_cli.optics.surfaces.polarfield import PolarField, direction_of
 from caustic_cli.project.project import Project
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.studies import lamp_verify
 from caustic_cli.studies.lamp import lamp_figures
 from caustic_cli.workflow.lamp import LampDesign
@@ -354,6 +356,51 @@ def test_a_tabulated_chip_is_designed_for_and_kept(tmp_path, monkeypatch, capfd)
     assert one["interior_rms"] < 0.7 * other["interior_rms"]  # the lens is made for its chip
     assert cli.run(["export", "table", "--format", "mitsuba"]) == 2
     assert "obey Lambert's law" in capfd.readouterr().err
+
+
+def measured(count=20_000):
+    """Rays of a Lambertian chip of 1 x 0.6 mm half a millimetre above the board, of unequal flux."""
+    rng = np.random.default_rng(4)
+    sine, turn = np.sqrt(rng.uniform(size=count)), 2.0 * math.pi * rng.uniform(size=count)
+    directions = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.sqrt(1.0 - sine * sine)], 1)
+    positions = np.stack([rng.uniform(-0.5, 0.5, count), rng.uniform(-0.3, 0.3, count), np.full(count, 0.5)], 1)
+    kept = rng.uniform(0.5, 1.5, count)
+    return RaySet(positions, directions, kept)
+
+
+def test_the_rays_of_a_file_are_drawn_by_their_flux():
+    rays = measured()
+    chip = Chip.of_rays(rays)
+    assert chip.size == pytest.approx((1.0, 0.6), abs=1e-2) and chip.reach == pytest.approx(math.hypot(0.5, 0.3, 0.5), abs=0.02)
+    assert mean_cosine(chip.intensity) == pytest.approx(2.0 / 3.0, abs=0.01)  # Lambert's law, in classes of 5 degrees
+    share = rays.flux / rays.flux.sum()
+    for (part,) in (list(emissions(chip, 100_000, 1)), list(chip_grids(chip, 4, 100_000))):
+        assert float(part.power.sum()) == pytest.approx(1.0) and float(part.origin[2].min()) == 0.5
+        for k in range(3):
+            mean = float((part.power * part.direction[k]).sum())
+            assert mean == pytest.approx(float((share * rays.directions[:, k]).sum()), abs=6e-3)
+    dark = replace(rays, directions=rays.directions * [1.0, 1.0, -1.0])
+    with pytest.raises(InputError, match="light within 90 degrees"):
+        Chip.of_rays(dark)
+
+
+def test_a_chip_of_a_ray_file_is_designed_for_and_kept(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    rays = measured()
+    Path("led.dat").write_bytes(zemax(rays.positions, rays.directions, rays.flux))
+    given = ["--lamp", "15", "--angles", "100x60", "--chip-rays", "led.dat"]
+    assert cli.run(["design", "uniform", *given, "--quiet", "--json", "-o", "led"]) == 0
+    figures = json.loads(capfd.readouterr().out)
+    assert figures["of_source"] > 0.75 and figures["of_source"] + sum(figures["lost"].values()) == pytest.approx(1.0)
+    assert Path("led/chip-rays.dat").read_bytes() == Path("led.dat").read_bytes()
+    Path("led.dat").unlink()
+    lamp = LampDesign.of(Project.open("led"))
+    assert lamp.lamp.chip.shape == "rays" and len(lamp.lamp.chip.rays.flux) == 20_000
+    assert cli.run(["export", "led", "--format", "ldt", "--quiet"]) == 0
+    Path("led.dat").write_bytes(zemax(20.0 * rays.positions, rays.directions, rays.flux))
+    for more, words in (([], "greater than the radius of the chip"), (["--chip", "1"], "leave out --chip")):
+        assert cli.run(["design", "uniform", *given, *more, "--quiet"]) == 2
+        assert words in capfd.readouterr().err
 
 
 def targets(goal):

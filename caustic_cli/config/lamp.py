@@ -60,6 +60,9 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
     if lamp.radius is None:
         raise InputError(f"⟨lamp.{next(iter(given['lamp']))}⟩ belongs to a lamp, which ⟨+lamp.radius⟩ makes")
     check_all("lamp", lamp, *lamp)
+    extent = ["chip"] if any(lamp.chip) else []
+    if "file" in lamp and (others := [*extent, *(key for key in ("shape", "intensity") if key in lamp)]):
+        raise InputError(f"⟨lamp.file⟩ holds where and how the chip emits: leave out ⟨lamp.{others[0]}⟩")
     lamp = lamp.filled(inner=INNER[lamp.surfaces] * lamp.radius)
     lens = LensSettings(given.get("lens", {}))
     lens = lens if {"index", "glass"} & {*lens} else lens.filled(glass=MATERIAL)
@@ -117,8 +120,11 @@ def lamp_of(settings: Settings) -> Lamp:
     """
     s = settings.lamp
     assert s is not None and s.radius is not None and s.inner is not None
-    table = getattr(s.intensity, "content", None)
-    chip = Chip("point", intensity=table) if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip, table)
+    table, rays = (getattr(file, "content", None) for file in (s.intensity, s.file))
+    if rays is not None:
+        chip = Chip.of_rays(rays)
+    else:
+        chip = Chip(intensity=table) if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip, table)
     return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall, s.surfaces, s.base, s.flange)
 
 

@@ -61,7 +61,7 @@ def write_lamp_mitsuba(
         InputError: as `lamp_mesh`, or the chip is not Lambertian, as emitters of Mitsuba are.
     """
     if lamp.chip.intensity is not None and not dark:
-        raise InputError("⟨format⟩ mitsuba holds chips that obey Lambert's law, and this one has the table ⟨lamp.intensity⟩")
+        raise InputError("⟨format⟩ mitsuba holds chips that obey Lambert's law, and this one has a table or a ray file")
     parts = lamp_parts(lamp, field, values, samples)
     for name, (points, faces, normals) in zip(PARTS, parts, strict=True):
         write_mesh(beside(path, name), points, faces, normals)

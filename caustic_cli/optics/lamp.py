@@ -39,6 +39,7 @@ from caustic_cli.optics.surfaces.polarfield import (
 from caustic_cli.optics.tolerances import LEAST_COSINE
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.rayset import RaySet
 
 #: Causes for which light is lost, in the order of their occurrence.
 LOSSES = ("inner_fresnel", "missed", "total_internal_reflection", "outer_fresnel")
@@ -96,7 +97,11 @@ def on_chip(chip: Chip, s: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
-    """About `count` rays of equal power, CHUNK at a time: stratified ones of a point, a Sobol sequence of a wider chip."""
+    """About `count` rays of equal power, CHUNK at a time: stratified ones of a point, a Sobol sequence of a wider chip, and of a
+    ray file its own, drawn at random by their flux, with replacement."""
+    if chip.rays is not None:
+        yield from _drawn(chip.rays, count, seed)
+        return
     point, side = chip.shape == "point", max(1, round(math.sqrt(count)))
     total = side * side if point else min(count, SOBOL_RAYS)
     for start in range(0, total, CHUNK):
@@ -114,6 +119,15 @@ def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
         yield ChipRays((x, y, torch.zeros_like(x)), (dx, dy, dz), torch.full_like(dx, 1.0 / total))
 
 
+def _drawn(rays: RaySet, count: int, seed: int) -> Iterator[ChipRays]:
+    """Rays of a ray file."""
+    rng, sums = np.random.default_rng(seed), np.cumsum(rays.flux)
+    for start in range(0, count, CHUNK):
+        at = np.searchsorted(sums, sums[-1] * rng.uniform(size=min(CHUNK, count - start)), side="right")
+        (x, y, z), (dx, dy, dz) = (torch.from_numpy(c[at]).unbind(1) for c in (rays.positions, rays.directions))
+        yield ChipRays((x, y, z), (dx, dy, dz), torch.full_like(x, 1.0 / count))
+
+
 def _tabulated(intensity: Distribution, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Components of directions, of equal flux for equal area of the unit disc."""
     fraction = x * x + y * y
@@ -127,8 +141,10 @@ def chip_grids(chip: Chip, points: int, count: int) -> Iterator[ChipRays]:
     (u, v), displaced from place to place by a part of its cells.
 
     The places have the mean square distances of the chip's points.  Their images are as smooth as those of a `PointGrid`, which a
-    design needs more than independence of the rays.
+    design needs more than independence of the rays; those of a ray file are its own.
     """
+    if chip.rays is not None:
+        return emissions(chip, count, 0)
     middle = (torch.arange(points, dtype=torch.float64) + 0.5) / points
     s, t = (c.reshape(-1) for c in torch.meshgrid(middle, middle, indexing="ij"))
     square = 1.0 / 12.0 if chip.shape == "rectangle" else 1.0 / 16.0

@@ -116,10 +116,15 @@ def _light(path: Path, _given: Given) -> _Read:
     """A ray file, or the picture of a disc's brightness as irradiance."""
     suffix = path.suffix.lower()
     if suffix in rayfiles.SUFFIXES:
-        data = read_bytes(path, rayfiles.MAX_BYTES, rayfiles.ACCEPTED)
-        return _Read(data, rayfiles.parse_rays(data, str(path)), suffix)
+        return _rays(path, _given)
     light = read_picture(path, linear=True).irradiance()
     return _Read(read_bytes(path, rayfiles.MAX_BYTES, rayfiles.ACCEPTED), light, suffix)
+
+
+def _rays(path: Path, _given: Given) -> _Read:
+    """A ray file."""
+    data = read_bytes(path, rayfiles.MAX_BYTES, rayfiles.ACCEPTED)
+    return _Read(data, rayfiles.parse_rays(data, str(path)), path.suffix.lower())
 
 
 def _intensity(path: Path, _given: Given) -> _Read:
@@ -170,6 +175,7 @@ READERS: dict[str, Callable[[Path, Given], _Read]] = {
     "source.file": _light,
     "source.intensity": _intensity,
     "lamp.intensity": _intensity,
+    "lamp.file": _rays,
     "source.spectrum": _spectrum,
     "lens.index_file": _index,
     "screen.shape_file": _sags,

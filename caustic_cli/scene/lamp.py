@@ -14,8 +14,11 @@ import numpy as np
 
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.rayset import RaySet
 
-SHAPES = ("point", "disc", "rectangle")
+SHAPES = ("point", "disc", "rectangle", "rays")
+#: Width of the classes of angles in which the intensity of a ray file is counted, degrees.
+CLASS = 5.0
 #: Widest target in the far field, degrees, along x and y: a lamp emits into z > 0.
 WIDEST = 178.0
 #: Border of a target, a fraction of its smaller side, that is no part of its interior: least, and most where a chip blurs more.
@@ -32,16 +35,35 @@ class Chip:
         InputError: an unknown shape, or a size that does not belong to it.
     """
 
-    #: point, disc (an ellipse where width and height differ) or rectangle.
+    #: point, disc (an ellipse where width and height differ), rectangle, or rays of a ray file.
     shape: str = "point"
     #: Full width and height, mm; 0 for a point.
     size: tuple[float, float] = (0.0, 0.0)
     #: Of every point of it by the angle from +z; None for Lambert's law.
     intensity: Distribution | None = None
+    #: Of a ray file, in the frame of the lamp.
+    rays: RaySet | None = None
+
+    @classmethod
+    def of_rays(cls, rays: RaySet) -> Chip:
+        """The chip that a ray file was measured of: its size is that of the places where rays begin, its intensity that of all.
+
+        Raises:
+            InputError: there is no light within 90 degrees of +z.
+        """
+        width, height = (2.0 * float(c) for c in np.abs(rays.positions[:, :2]).max(0))
+        edges = np.arange(0.0, 90.0 + CLASS, CLASS)
+        angle = np.degrees(np.arccos(rays.directions[:, 2].clip(-1.0, 1.0)))
+        seen = np.histogram(angle, edges, weights=rays.flux)[0] / -np.diff(np.cos(np.radians(edges)))
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        values = np.concatenate([seen[:1], seen, seen[-1:]])
+        return cls("rays", (width, height), Distribution((0.0, *middle.tolist(), 90.0), tuple(values.tolist())), rays)
 
     def __post_init__(self):
-        if self.shape not in SHAPES:
-            raise InputError(f"the shape of a chip must be one of {', '.join(SHAPES)}, got {self.shape!r}")
+        if self.shape not in SHAPES or (self.shape == "rays") != (self.rays is not None):
+            raise InputError(f"the shape of a chip must be one of {', '.join(SHAPES[:3])}, got {self.shape!r}")
+        if self.rays is not None:
+            return
         if not all(math.isfinite(s) and s >= 0 for s in self.size):
             raise InputError(f"the size of a chip must be finite and not negative, got {self.size}")
         if (self.shape == "point") != (self.size == (0.0, 0.0)) or (min(self.size) == 0 < max(self.size)):
@@ -57,6 +79,8 @@ class Chip:
     @property
     def reach(self) -> float:
         """Largest distance of its points from the origin, mm."""
+        if self.rays is not None:
+            return float(np.linalg.norm(self.rays.positions, axis=1).max())
         return 0.5 * (math.hypot(*self.size) if self.shape == "rectangle" else max(self.size))
 
 

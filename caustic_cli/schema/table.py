@@ -300,6 +300,8 @@ class LampSettings(Section):
     intensity: str | None = setting("angular distribution of the chip instead of Lambert's law: a .csv of degrees from +z and"
             " relative intensity, or a photometric file (.ies, .ldt) symmetric about its axis", derived="Lambert's law",
             option=Option("--chip-intensity", "FILE"), file="chip")
+    file: str | None = setting("ray file (TM-25 and others, as of a source) of the chip instead, in the frame of the lamp",
+            derived="a chip by its size", option=Option("--chip-rays", "FILE"), file="chip-rays")
     angles: Pair | None = setting("full width and height of the picture in the far field, its values being intensities: longitude"
             " about the vertical and latitude (type A photometry)", "degrees", 0.0, 178.0, above=True, derived="a picture on a"
             " screen", option=Option("--angles", "W[xH]"))

@@ -58,7 +58,11 @@ def verify_lamp(
 
 
 def _emitted(chip: Chip, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Origins (3, N) mm on a chip and directions (3, N): by polar angles, independent of `optics.lamp`; of a table by rejection."""
+    """Origins (3, N) mm on a chip and directions (3, N): by polar angles, independent of `optics.lamp`; of a table by rejection,
+    of a ray file its own."""
+    if chip.rays is not None:
+        at = rng.choice(len(chip.rays.flux), count, p=chip.rays.flux / chip.rays.flux.sum())
+        return chip.rays.positions[at].T, chip.rays.directions[at].T
     sine, turn = np.sqrt(rng.uniform(size=count)), 2.0 * math.pi * rng.uniform(size=count)
     if chip.intensity is not None:
         sine, most = np.empty(0), max(chip.intensity.values)
