@@ -98,13 +98,13 @@ def run(asked: DesignOptions) -> None:
 
     from caustic_cli.config.lamp import asks_for_lamp, says_lamp  # noqa: PLC0415
     from caustic_cli.inverse import ranks  # noqa: PLC0415
-    from caustic_cli.workflow import library  # noqa: PLC0415
+    from caustic_cli.workflow import lamp, library  # noqa: PLC0415
     from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
-    if says_lamp(project) if asked.resume else asks_for_lamp(asked.given, asked.preset, asked.config):
-        with _saying_what_is_kept(path):
-            _design_lamp(asked, picture, path)
-        return
+    for_lamp = says_lamp(project) if asked.resume else asks_for_lamp(asked.given, asked.preset, asked.config)
+    if for_lamp:
+        _refuse_for_lamps(asked)
+        device = "cuda" if asked.device == "cuda" else "cpu"
     if asked.plan:
         _print_plan(asked, picture)
         return
@@ -119,34 +119,21 @@ def run(asked: DesignOptions) -> None:
         else:
             how |= {"preset": asked.preset, "config": asked.config, "out": path}
             lens = library.design_of(picture, asked.given, error=asked.error, **how)
-    say.table(lens.figures["project"], console.figures_rows(lens.figures))
+    say.table(lens.figures["project"], (lamp.rows if for_lamp else console.figures_rows)(lens.figures))
     if asked.json:
         console.emit_json(lens.figures)
 
 
-def _design_lamp(asked: DesignOptions, picture: Any, path: Path) -> None:
-    """Design a lamp and print its figures.
+def _refuse_for_lamps(asked: DesignOptions) -> None:
+    """Refuse what no lamp is designed with.
 
     Raises:
-        InputError: an option is given that belongs to a lens with a height field.
+        InputError: several processes, or --plan.
     """
-    from caustic_cli.workflow import lamp, library  # noqa: PLC0415
-
     if checks.rank_and_size()[1] > 1:
         raise InputError("a lamp is designed by one process, and torchrun has started more")
     if asked.plan:
         raise InputError("--plan is for a lens before its light, not for a lamp around it")
-    how: dict[str, Any] = {"force": asked.force, "movie": asked.movie, "say": asked.say}
-    how["device"] = "cuda" if asked.device == "cuda" else "cpu"
-    if asked.resume:
-        iterations, time_limit = (asked.given.get(setting) for setting in CONTINUED)
-        figures = library.resume(picture, iterations=iterations, time_limit=time_limit, **how).figures
-    else:
-        how |= {"preset": asked.preset, "config": asked.config, "out": path, "error": asked.error}
-        figures = library.design_of(picture, asked.given, **how).figures
-    asked.say.table(figures["project"], lamp.rows(figures))
-    if asked.json:
-        console.emit_json(figures)
 
 
 def _check(asked: DesignOptions) -> None:
