@@ -112,7 +112,7 @@ class Effort:
         (24_000, 250_000, 80, 0.015),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.
-    chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_000, 400_000, 70, 0.01),)
+    chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_000, 400_000, 70, 0.035),)
     #: Spans of the spline along both axes in a stage with enough pixels; cells of the light along both axes for the transport;
     #: pixels on which the lamp of a point is judged, that of a chip on a quarter of them.
     lamp_spans: int = 64

@@ -444,8 +444,7 @@ def test_the_edges_that_a_chip_blurs_count_little():
     one, other = (LampObjective(Lamp(chip), goal, FIELD, target, 3000) for chip in (Chip(), Chip("disc", (0.5, 0.5))))
     assert float(one.weights.min()) == 1.0 and float(other.weights.min()) < 0.02
     assert float((other.weights == 1.0).sum()) == (20 - 2) * (10 - 2)  # less 3.8 degrees, a pixel of 4, at every edge
-    assert float((other.target * other.seen).sum()) == pytest.approx(1.0)
-    assert float(other.target.sum()) > 1.0
+    assert float((other.target * other.seen).sum()) == pytest.approx(1.0) and float(other.target.sum()) > 1.2
 
 
 @pytest.mark.parametrize("goal", [Goal((2000.0, 2000.0), 1000.0), Goal((100.0, 60.0)), Goal((5e3, 4e3), 4e3, (8e2, -6e2))])

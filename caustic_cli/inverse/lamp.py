@@ -38,7 +38,7 @@ MARGIN = 0.005
 #: Dark pixels around the target on which light beside it is seen; and the filter of the image.
 APRON, FILTER = 4, Filter("cosine", (3, 3))
 #: Points of a chip along both of its axes; weight of the pixels on the border that it blurs, and of the apron.
-CHIP_POINTS, BLURRED = 8, 0.01
+CHIP_POINTS, BLURRED = 8, 0.005
 #: Least pixels of a stage per square of a span of the spline: finer waves than pixels show would grow unseen, and cost most of the
 #: iterations of the following stage.
 PER_SPAN = 3
@@ -88,12 +88,13 @@ class LampObjective:
     Args:
         target: (n_x, n_y) as of `wanted`.
         rays: about.
-        weight: w, see the module.
+        weight: w, see the module; of a chip for a blur as wide as the border, and in proportion to it, since the light at stake at
+            the edges is.
     """
 
     def __init__(self, lamp: Lamp, goal: Goal, field: PolarField, target: Tensor, rays: int, weight: float = 0.1):
-        self.goal, self.weight = goal, weight
         point = lamp.chip.shape == "point"
+        self.goal, self.weight = goal, weight if point else weight * lamp.blur(goal) / lamp.border(goal)
         self.rays: Sequence[PointGrid | ChipRays]
         self.rays = PointGrid.of(field, rays, lamp.chip) if point else list(chip_grids(lamp.chip, CHIP_POINTS, rays))
         self.through = partial(through_point if point else through, lamp, field)
