@@ -22,6 +22,7 @@ from caustic_cli.export.mitsuba import write_mitsuba
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.io.archive import open_archive
 from caustic_cli.io.intensities import parse_distribution
+from caustic_cli.io.photometry import Photometry, write_ies, write_ldt
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.brightness import points_by_brightness
@@ -281,12 +282,34 @@ def test_impossible_ones_are_refused(what, message):
         what()
 
 
+def photometry(lopsided):
+    """Light of a file whose planes differ by twice this part."""
+    planes, angles = 90.0 * np.arange(4), 10.0 * np.arange(10)
+    around = 1.0 + lopsided * np.cos(np.radians(planes))
+    return Photometry(planes, angles, 300.0 * around[:, None] * np.cos(np.radians(angles)))
+
+
+@pytest.mark.parametrize("write", [write_ies, write_ldt])
+def test_a_photometric_file_symmetric_about_its_axis_is_a_distribution(write, tmp_path):
+    path = tmp_path / f"led{write.__name__.replace('write_', '.')}"
+    write(path, photometry(0.02))
+    found = parse_distribution(path.read_bytes(), str(path))
+    assert found.angles == tuple(10.0 * np.arange(10))
+    np.testing.assert_allclose(found.values, 300.0 * np.cos(np.radians(found.angles)), rtol=1e-5, atol=1e-4)
+    write(path, photometry(0.3))
+    with pytest.raises(InputError, match="planes C differ by 30% of the peak"):
+        parse_distribution(path.read_bytes(), str(path))
+    with pytest.raises(InputError, match="a photometric file of type C"):
+        parse_distribution(b"IES\nnothing", "led.ies")
+
+
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_blob()
     Image.fromarray(np.array([[0, 255], [255, 255]], np.uint8)).save("die.png")
     Path("led.csv").write_text("angle,intensity\n0,1\n10,2\n60,0\n")
+    write_ldt(Path("led.ldt"), photometry(0.0))
     Path("rays.dat").write_bytes(zemax(np.zeros((9, 3)), np.tile([0.0, 0.0, 1.0], (9, 1)), np.ones(9)))
 
 
@@ -300,6 +323,7 @@ def run(capfd, *arguments, code=0):
     ("source", "kept"),
     [
         (["--source", "point", "--intensity", "led.csv"], {"intensity.csv": "led.csv"}),
+        (["--source", "point", "--intensity", "led.ldt"], {"intensity.ldt": "led.ldt"}),
         (
             ["--source", "disc", "--source-file", "die.png", "--source-size", "1", "--intensity", "led.csv"],
             {"intensity.csv": "led.csv", "source.png": "die.png"},
@@ -334,7 +358,7 @@ def test_designs_keep_their_files(here, capfd, source, kept):
     )
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], rel=0.05)
     assert workflow.Project.open("blob.caustic").settings.source.intensity == (
-        "intensity.csv" if "intensity.csv" in kept else "lambertian" if "lambertian" in source else "uniform"
+        next((name for name in kept if name.startswith("intensity")), "lambertian" if "lambertian" in source else "uniform")
     )
 
 

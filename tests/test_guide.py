@@ -98,7 +98,7 @@ def test_the_commands_of_a_chapter_run(chapter, home, monkeypatch, capfd):
         where = few.index("2>") if "2>" in few else len(few)
         if "--screen" in few or "window-floor" in few or "sundial" in few:  # which say where the screen is
             monkeypatch.delenv("CAUSTIC_DESIGN_THROW")
-        if "--lamp" in few or "street" in few or "spot" in few:  # which have no settings of a height field
+        if "--lamp" in few or {"street", "spot", "headlamp"} & {*few}:  # which have no settings of a height field
             for name in OF_HEIGHT_FIELDS:
                 monkeypatch.delenv(name)
         status = cli.run(few[:where])

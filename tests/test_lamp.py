@@ -7,25 +7,28 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import brentq
+from scipy.spatial import cKDTree
 
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.lamp import LampObjective, design_lamp, directions_of, field_of, pixels_of, wanted
+from caustic_cli.inverse.lamp import LampObjective, design_lamp, directions_of, field_of, pixels_of, refined, wanted
+from caustic_cli.inverse.lamp_limits import chip_limits, etendue_limit, least_error
 from caustic_cli.inverse.refractor_transport import envelope, source_directions
-from caustic_cli.optics.lamp import PointGrid, emissions, land, least_wall, through, through_point
+from caustic_cli.optics.lamp import PointGrid, chip_grids, concentric, emissions, land, least_wall, through, through_point
+from caustic_cli.optics.surfaces.base import SECOND
 from caustic_cli.optics.surfaces.polarfield import PolarField, direction_of, frame, stereographic
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
-from caustic_cli.studies.lamp import lamp_figures
+from caustic_cli.studies.lamp import cut_off, lamp_figures
 
 FIELD = PolarField.uniform((12, 9), (3, 4))
 FAR = Goal((100.0, 60.0))
-QUICK = replace(STANDARD, lamp_stages=((400, 10_000, 25, 0.1), (1000, 20_000, 25, 0.02)), lamp_control=32, lamp_cells=20)
+QUICK = replace(STANDARD, lamp_stages=((400, 10_000, 25, 0.1), (1000, 20_000, 25, 0.02)), lamp_spans=16, lamp_cells=20)
 
 
 def bumpy(field=FIELD, radius=12.0, height=0.05, seed=0):
-    """A sphere with bumps: control values of log r."""
+    """A sphere with bumps: control values of r."""
     noise = torch.randn(field.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return field.sphere(radius) + height * noise
+    return field.sphere(radius) * (height * noise).exp()
 
 
 def random(*shape, seed=1):
@@ -65,6 +68,14 @@ def test_normals_are_perpendicular_to_the_derivatives_of_the_points():
     assert bool(((normal * torch.stack(FIELD.points(values, u, v), 1)).sum(1) > 0).all())
 
 
+@pytest.mark.parametrize("degree", [(3, 4), (2, 5), (1, 3)])
+def test_second_derivatives_are_those_of_the_basis(degree):
+    field = PolarField.uniform((12, 9), degree)
+    values, (u, v) = bumpy(field), 2.0 * random(2, 50) - 1.0
+    for found, expected in zip(field.second(values, u, v), field.at(values, u, v, SECOND), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
+
+
 def test_a_sphere_has_its_radius_everywhere_and_refuses_none():
     u, v = 1.4 * random(2, 10) - 0.7
     points = torch.stack(FIELD.points(FIELD.sphere(7.5), u, v))
@@ -84,7 +95,7 @@ def test_intersections_are_the_first_crossing_found_by_brute_force(height):
     t = torch.linspace(0.0, 24.0, 2401, dtype=torch.float64)[:, None]
     x, y, z = (o + t * d for o, d in zip(origin, direction, strict=True))
     u, v = stereographic(x, y, torch.where(t == 0, torch.ones_like(z), z))
-    outside = 0.5 * (x * x + y * y + z * z).log() > FIELD.at(values, u.reshape(-1), v.reshape(-1), [(0, 0)])[0].view(u.shape)
+    outside = (x * x + y * y + z * z).sqrt() > FIELD.at(values, u.reshape(-1), v.reshape(-1), [(0, 0)])[0].view(u.shape)
     first, crossings = outside.double().argmax(0), (outside.diff(dim=0)).sum(0)
     found = torch.stack([p - o for p, o in zip(hit.point, origin, strict=True)]).norm(dim=0)
     once = crossings == 1
@@ -92,7 +103,7 @@ def test_intersections_are_the_first_crossing_found_by_brute_force(height):
     assert bool(hit.valid[once].all())
     assert float((found - t[first, 0])[once].abs().max()) < 1.05e-2  # the spacing of the samples
     r = torch.stack(hit.point).norm(dim=0)
-    torch.testing.assert_close(r.log()[hit.valid], FIELD.at(values, hit.u, hit.v, [(0, 0)])[0][hit.valid], rtol=0, atol=1e-12)
+    torch.testing.assert_close(r[hit.valid], FIELD.at(values, hit.u, hit.v, [(0, 0)])[0][hit.valid], rtol=0, atol=1e-12)
 
 
 def test_rays_that_start_outside_have_no_intersection():
@@ -144,6 +155,26 @@ def test_all_light_is_booked(chip):
     assert float((norm - 1.0).abs().max()) < 1e-12
 
 
+@pytest.mark.parametrize("chip", [Chip("disc", (4.0, 2.0)), Chip("rectangle", (2.0, 1.0))])
+def test_the_grids_of_a_chip_carry_the_light_of_independent_rays(chip):
+    parts = list(chip_grids(chip, 4, 300_000))
+    assert len(parts) > 1 and sum(float(part.power.sum()) for part in parts) == pytest.approx(1.0, abs=1e-12)
+    moments = [lambda o, d: o[0] ** 2, lambda o, d: o[1] ** 2, lambda o, d: d[2], lambda o, d: d[0] ** 2, lambda o, d: o[0] * d[0]]
+    other = emit(chip, 100_000, 2)
+    for moment in moments:
+        mean = sum(float((part.power * moment(part.origin, part.direction)).sum()) for part in parts)
+        assert mean == pytest.approx(float((other.power * moment(other.origin, other.direction)).sum()), rel=0.01, abs=1e-3)
+    assert sum(len(part.power) for part in parts) == pytest.approx(300_000, rel=0.02)
+
+
+def test_the_interior_of_a_target_is_what_a_chip_does_not_blur():
+    road = Goal((30_000.0, 10_000.0), 8000.0)
+    assert Lamp().border(road) == 250.0  # of a point
+    assert Lamp(Chip("rectangle", (0.5, 0.3))).border(road) == pytest.approx(2.0 * 0.5 / 15.0 * 8000.0)
+    assert Lamp(Chip("disc", (3.0, 3.0))).border(road) == 1000.0
+    assert Lamp(Chip("disc", (1.0, 1.0))).blur(Goal((90.0, 30.0))) == pytest.approx(math.degrees(1.0 / 15.0))
+
+
 def test_a_sphere_about_a_point_loses_what_normal_incidence_reflects():
     lamp, rays = Lamp(), emit(Chip(), 1000, 0)
     light = through(lamp, FIELD, rays, FIELD.sphere(15.0))
@@ -178,7 +209,7 @@ def test_rays_are_those_of_a_textbook_tracer():
         """|P| - r(P) of points (.., 3)."""
         x, y, z = torch.from_numpy(np.atleast_2d(points)).T
         u, v = stereographic(x, y, z)
-        return np.linalg.norm(points, axis=-1) - np.squeeze(FIELD.at(values, u, v, [(0, 0)])[0].exp().numpy())
+        return np.linalg.norm(points, axis=-1) - np.squeeze(FIELD.at(values, u, v, [(0, 0)])[0].numpy())
 
     def normal(point, h=1e-6):
         """The gradient of |P| - r(P), by differences."""
@@ -228,7 +259,7 @@ def test_an_ellipsoid_with_the_chip_at_its_focus_sends_all_light_into_one_direct
     u, v = (c.reshape(-1) for c in torch.meshgrid(*field.net.control_xy(), indexing="ij"))
     g = torch.zeros(1, dtype=torch.float64)
     log_r = envelope(direction_of(u, v), y[None], torch.ones(1, dtype=torch.float64), g, 0.01, lamp.index)
-    values = field.net.interpolated(log_r.view(field.shape)) + math.log(10.0)
+    values = field.net.interpolated(10.0 * log_r.exp().view(field.shape))
     (grid,) = PointGrid.of(field, 5000)
     light = through_point(lamp, field, grid, values)
     x = torch.stack(direction_of(grid.u, grid.v), 1)
@@ -240,7 +271,7 @@ def test_an_ellipsoid_with_the_chip_at_its_focus_sends_all_light_into_one_direct
 
 def test_coordinates_on_a_plane_and_in_the_far_field_are_those_of_directions():
     pixels = (7, 5)
-    for goal in (FAR, Goal((4000.0, 3000.0), 2000.0)):
+    for goal in (FAR, Goal((4000.0, 3000.0), 2000.0), Goal((4000.0, 3000.0), 2000.0, (700.0, -2500.0))):
         d = directions_of(goal, pixels)
         light = through(Lamp(), FIELD, emit(Chip(), 4, 0), FIELD.sphere(10.0))
         zero = torch.zeros(len(d), dtype=torch.float64)
@@ -255,6 +286,17 @@ def test_the_light_wanted_in_the_far_field_is_intensity_times_solid_angle():
     edges = np.sin(np.radians(np.linspace(-60.0, 60.0, 9)))
     np.testing.assert_allclose(power[0].numpy() / float(power[0].sum()), np.diff(edges) / (edges[-1] - edges[0]), rtol=1e-12)
     assert pixels_of(Goal((30.0, 10.0), 8.0), 1200) == (60, 20)
+
+
+def test_a_shifted_target_lies_where_it_was_shifted_to():
+    goal = Goal((4000.0, 2000.0), 2000.0, (500.0, -800.0))
+    d = directions_of(goal, (2, 2))
+    x, y = 2000.0 * d[:, 0] / d[:, 2], 2000.0 * d[:, 1] / d[:, 2]
+    np.testing.assert_allclose(torch.stack([x, y], 1), [[-500, -1300], [-500, -300], [1500, -1300], [1500, -300]])
+    assert goal.nearest_edge == pytest.approx(math.degrees(math.atan(0.1)))
+    assert replace(goal, shift=(0.0, 3000.0)).nearest_edge == pytest.approx(-45.0)
+    assert Goal((4000.0, 2000.0), 2000.0).nearest_edge == pytest.approx(math.degrees(math.atan(0.5)))
+    assert FAR.nearest_edge == 30.0
 
 
 def test_the_light_of_the_transport_is_lambertian():
@@ -288,7 +330,7 @@ def test_all_light_is_booked_between_two_surfaces_and_the_grid_carries_the_same(
         assert float(light.lost["inner_fresnel"].sum()) > 0.0387
     light = through(lamp, FIELD, emit(Chip(), 100_000, 3), values)
     grids = [through_point(lamp, FIELD, grid, values) for grid in PointGrid.of(FIELD, 100_000)]
-    assert sum(float(one.power.sum()) for one in grids) == pytest.approx(float(light.power.sum()), abs=1e-4)
+    assert sum(float(one.power.sum()) for one in grids) == pytest.approx(float(light.power.sum()), abs=2e-4)
 
 
 def test_light_that_leaves_the_glass_on_its_way_is_booked_as_missed():
@@ -296,7 +338,7 @@ def test_light_that_leaves_the_glass_on_its_way_is_booked_as_missed():
     light = through(Lamp(surfaces=2), FIELD, rays, torch.stack([FIELD.sphere(6.0), FIELD.sphere(5.0)]))  # crossed
     assert float(light.power.sum()) == 0.0 and float(light.lost["missed"].sum()) > 0.9
     dented = FIELD.sphere(4.0)
-    dented[5:7, :] += 0.9  # a wall across the inner surface, through which light of its flanks passes twice
+    dented[5:7, :] *= 2.46  # a wall across the inner surface, through which light of its flanks passes twice
     with torch.no_grad():
         light = through(Lamp(inner=3.0, surfaces=2), FIELD, emit(Chip(), 20_000, 1), torch.stack([dented, FIELD.sphere(15.0)]))
     assert 0.0 < float(light.lost["missed"].sum()) < 0.9
@@ -335,14 +377,19 @@ def test_two_surfaces_pass_more_light_than_one_and_keep_their_limits():
     effort = replace(QUICK, two_stages=((400, 10_000, 40, 0.1),), lamp_stages=((400, 10_000, 40, 0.1),))
     fine, coarse = (wanted(goal, square, pixels_of(goal, count)).numpy() for count in (1500, 400))
     found = {}
-    for surfaces, inner in ((1, 4.0), (2, 2.0)):
-        lamp = Lamp(index=1.49, inner=inner, surfaces=surfaces)
+    for surfaces, inner, wall in ((1, 4.0, 1.0), (2, 2.0, 1.5)):
+        lamp = Lamp(index=1.49, inner=inner, wall=wall, surfaces=surfaces)
         values = design_lamp(lamp, goal, square, effort=effort)
         _, found[surfaces] = lamp_figures(lamp, goal, field_of(effort), values, fine, coarse, rays=100_000)
         assert found[surfaces]["least_wall"] >= lamp.wall
     assert found[2]["of_source"] > found[1]["of_source"] + 0.02
-    assert found[2]["greatest_radius"] < 15.5
-    assert FIELD.extent(values[0])[0] > 0.0 and field_of(effort).extent(values[0])[0] > 0.9 * 2.0
+    assert found[2]["greatest_radius"] < 15.1
+    field = field_of(effort)
+    assert field.extent(values[0])[0] > 0.9 * 2.0
+    dx, dy = concentric(*random(2, 1_000_000))  # the gap at a million points
+    at = stereographic(dx, dy, (1.0 - dx * dx - dy * dy).clamp_min(0.0).sqrt())
+    inner, outer = (np.stack([c.numpy() for c in field.points(net, *at)], 1) for net in values)
+    assert float(cKDTree(inner).query(outer, distance_upper_bound=2.0)[0].min()) >= 1.5
 
 
 # Gradients
@@ -382,16 +429,35 @@ def test_the_loss_is_differentiable_to_second_order_remainders(chip):
 # Design
 
 
-@pytest.mark.parametrize("goal", [Goal((2000.0, 2000.0), 1000.0), Goal((100.0, 60.0))])
+def test_a_net_of_more_spans_is_the_same_surface():
+    effort = replace(STANDARD, lamp_spans=16)
+    assert [field_of(effort, pixels).shape[0] for pixels in (800, 700, 190)] == [19, 11, 7]
+    coarse, fine = field_of(effort, 190), field_of(effort)
+    values, (u, v) = torch.stack([bumpy(coarse), bumpy(coarse, seed=3)]), 1.8 * random(2, 50) - 0.9
+    for one, other in zip(values, refined(coarse, values, fine), strict=True):
+        torch.testing.assert_close(torch.stack(coarse.at(one, u, v)), torch.stack(fine.at(other, u, v)), rtol=0, atol=1e-12)
+
+
+def test_the_edges_that_a_chip_blurs_count_little():
+    goal = Goal((80.0, 40.0))
+    target = wanted(goal, np.ones((2, 2)), (20, 10))
+    one, other = (LampObjective(Lamp(chip), goal, FIELD, target, 3000) for chip in (Chip(), Chip("disc", (0.5, 0.5))))
+    assert float(one.weights.min()) == 1.0 and float(other.weights.min()) < 0.02
+    assert float((other.weights == 1.0).sum()) == (20 - 2) * (10 - 2)  # less 3.8 degrees, a pixel of 4, at every edge
+    assert float((other.target * other.seen).sum()) == pytest.approx(1.0) and float(other.target.sum()) > 1.2
+
+
+@pytest.mark.parametrize("goal", [Goal((2000.0, 2000.0), 1000.0), Goal((100.0, 60.0)), Goal((5e3, 4e3), 4e3, (8e2, -6e2))])
 def test_a_small_design_lights_its_target(goal):
     losses = []
-    values = design_lamp(Lamp(), goal, np.ones((2, 2)), effort=QUICK, on_iteration=lambda *step: losses.append(step))
+    lamp = Lamp(inner=4.0 if goal.shift == (0.0, 0.0) else 3.0)
+    values = design_lamp(lamp, goal, np.ones((2, 2)), effort=QUICK, on_iteration=lambda *step: losses.append(step))
     assert losses[-1][2] < losses[0][2]
     assert {stage for stage, _, _ in losses} == {0, 1}
     fine, coarse = (wanted(goal, np.ones((2, 2)), pixels_of(goal, count)).numpy() for count in (2000, 400))
-    found, figures = lamp_figures(Lamp(), goal, field_of(QUICK), values, fine, coarse, rays=200_000, seed=5)
+    found, figures = lamp_figures(lamp, goal, field_of(QUICK), values, fine, coarse, rays=200_000, seed=5)
     assert figures["of_source"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-12)
-    assert figures["of_source"] > 0.82
+    assert figures["of_source"] > (0.82 if goal.shift == (0.0, 0.0) else 0.72)  # light of one side has farther to go
     assert figures["interior_rms"] < 0.12
     assert figures["uniformity"] > 0.6
     assert found.image.sum() == pytest.approx(figures["of_source"], abs=1e-12)
@@ -399,14 +465,14 @@ def test_a_small_design_lights_its_target(goal):
 
 def test_a_design_is_repeated_to_the_bit():
     stages = ((100, 2000, 3, 0.1),)
-    effort = replace(STANDARD, lamp_stages=stages, chip_stages=stages, lamp_control=10, lamp_cells=12)
+    effort = replace(STANDARD, lamp_stages=stages, chip_stages=stages, lamp_spans=6, lamp_cells=12)
     chip, goal = Lamp(Chip("disc", (0.5, 0.5))), Goal((80.0, 80.0))
     one, other = (design_lamp(chip, goal, np.ones((2, 2)), effort=effort) for _ in range(2))
     assert torch.equal(one, other)
 
 
 def test_a_surface_too_near_to_the_hemisphere_is_refused_with_the_radius_needed():
-    goal, effort = Goal((100.0, 100.0)), replace(STANDARD, lamp_stages=(), lamp_control=10, lamp_cells=16)
+    goal, effort = Goal((100.0, 100.0)), replace(STANDARD, lamp_stages=(), lamp_spans=6, lamp_cells=16)
     with pytest.raises(InputError, match=r"radius of [\d.]+ mm or more") as error:
         design_lamp(Lamp(inner=5.0, radius=6.5), goal, np.ones((2, 2)), effort=effort)
     radius = float(str(error.value).split("radius of ")[1].split()[0])
@@ -427,6 +493,8 @@ def test_a_surface_too_near_to_the_hemisphere_is_refused_with_the_radius_needed(
         (lambda: Goal((0.0, 1.0), 5.0), "greater than 0"),
         (lambda: Goal((1.0, 1.0), 0.0), "distance"),
         (lambda: Goal((180.0, 20.0)), "at most 178 degrees"),
+        (lambda: Goal((80.0, 20.0), shift=(1.0, 0.0)), "centred on the axis"),
+        (lambda: Goal((80.0, 20.0), 90.0, (math.nan, 0.0)), "shift of a target must be finite"),
         (lambda: wanted(Goal((10.0, 10.0)), np.zeros((3, 3)), (4, 4)), "black"),
     ],
 )
@@ -435,3 +503,45 @@ def test_values_out_of_range_are_refused_in_one_line(make, words):
         make()
     assert words in str(error.value)
     assert "\n" not in str(error.value)
+
+
+# The upper edge
+
+
+@pytest.mark.parametrize("wide", [0.4, 2.0])
+def test_the_cut_off_is_the_angle_between_two_parts_of_the_intensity_beneath(wide):
+    latitude = (np.arange(1800) + 0.5) * 0.1 - 90.0
+    intensity = np.clip(0.5 - (latitude - 3.0) / wide, 0.0, 1.0) * (latitude > -20.0)  # a ramp
+    rise = intensity * np.cos(np.radians(latitude))
+    assert cut_off(rise) == pytest.approx(0.8 * wide, rel=0.08)
+    assert cut_off(0.0 * rise) is None
+    assert cut_off(np.where(np.arange(1800) == 900, 1.0, 0.0)) is None
+
+
+# Limits by the chip
+
+
+def test_a_narrow_target_takes_no_more_light_than_its_etendue():
+    """Of a cone about the axis the etendue is known: pi R^2 (w + pi sin^2) / 2, w its solid angle."""
+    chip = Chip("disc", (4.0, 4.0))
+    wide = etendue_limit(Lamp(chip), Goal((30_000.0, 10_000.0), 8000.0))
+    assert wide > 1.0 and etendue_limit(Lamp(), FAR) == math.inf
+    for goal, solid in (
+        (Goal((6.0, 6.0)), math.radians(6.0) * 2.0 * math.sin(math.radians(3.0))),
+        (Goal((10.0, 10.0), 100.0), 0.01),
+    ):
+        expected = math.pi * 15.0**2 * solid / (math.pi * math.pi * 4.0)
+        assert etendue_limit(Lamp(chip), goal) == pytest.approx(expected, rel=5e-3)
+    half = etendue_limit(Lamp(chip, radius=1e3), Goal((178.0, 178.0)))
+    assert half == pytest.approx(0.25e6 * 1.5, rel=0.02)  # the half ball in all directions: pi R^2 (2 pi + pi) / 2
+
+
+def test_the_error_of_fine_shades_is_bounded_behind_the_blur_of_a_chip():
+    stripes = np.repeat((np.arange(16) % 2 == 0) * 1.0 + 0.2, 6)[:, None] * np.ones((1, 60))
+    goal = Goal((12_000.0, 6000.0), 8000.0)
+    small, large = (least_error(Lamp(Chip("disc", (s, s))), goal, stripes, 400) for s in (0.3, 3.0))
+    assert small < 0.01 and 0.2 < large < 0.72  # of two shades 1.2 and 0.2 the standard deviation is 0.71
+    words = list(chip_limits(Lamp(Chip("rectangle", (2.0, 2.0))), goal, stripes, 200))
+    assert len(words) == 2 and "blurs the picture by 1067 mm" in words[0] and "of less than 0." in words[1]
+    assert "by etendue, at most 35%" in list(chip_limits(Lamp(Chip("disc", (4.0, 4.0))), Goal((8.0, 8.0)), np.ones((2, 2)), 9))[1]
+    assert list(chip_limits(Lamp(), goal, stripes, 9)) == []

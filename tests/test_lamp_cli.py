@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,21 @@ import pytest
 import torch
 from PIL import Image
 
+import caustic_cli
 from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import lamp_mesh
+from caustic_cli.inverse import lamp as inverse
 from caustic_cli.io.photometry import Photometry, read_photometry, write_ies, write_ldt
 from caustic_cli.io.picture import read_picture
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.project.project import Project
-from caustic_cli.scene.lamp import Lamp
+from caustic_cli.scene.lamp import Goal, Lamp
+from caustic_cli.studies import verify
+from caustic_cli.studies.lamp_report import density
 from caustic_cli.studies.photometry import intensity_table
+from caustic_cli.studies.verify import compare
+from caustic_cli.workflow import lamp as workflow
 from caustic_cli.workflow.lamp import LampDesign
 
 ROAD = ["--lamp", "15", "--throw", "8m", "--picture-size", "30mx10m", "--quiet"]
@@ -99,6 +106,17 @@ def test_a_design_in_the_far_field_tells_its_peak_and_its_angles(capfd):
     assert "cd per 1000 lm" in capfd.readouterr().out
 
 
+def test_a_lamp_may_stand_beside_its_picture(capfd):
+    given = ["--lamp", "15", "--throw", "8m", "--picture-size", "16mx8m", "--screen-shift", "0,3m", "--lamp-inner", "2"]
+    assert cli.run(["design", "uniform", *given, "-o", "beside"]) == 0
+    assert "turned by 83 to reach the nearest edge" in capfd.readouterr().err
+    figures = figures_of(capfd, "render", "beside", "--rays", "20000", "-o", "a.png", "--npy", "a.npy")
+    assert figures["of_source"] > 0.75
+    assert Project.open("beside").settings.screen.shift == (0.0, 3000.0)
+    seen = np.load("a.npy").sum(0)
+    assert seen[: len(seen) // 2].sum() == pytest.approx(0.5 * seen.sum(), rel=0.15)  # either half of the picture is lit
+
+
 def test_a_chip_of_any_shape_is_designed_for(capfd):
     for shape in ("rectangle", "disc"):
         given = ["--chip", "1x0.5", "--chip-shape", shape, "--glass", "PMMA", "-o", shape]
@@ -130,7 +148,7 @@ def test_two_surfaces_are_designed_rendered_and_exported(capfd):
     figures = figures_of(capfd, "design", "uniform", *ROAD[:-1], "--lamp-surfaces", "2", "--chip", "0.5", "-o", "two")
     assert figures["of_source"] > 0.8 and figures["least_wall"] > 1.0
     found = LampDesign.of(Project.open("two"))
-    assert found.values.shape == (2, 24, 24) and found.lamp.inner == 2.0
+    assert found.values.shape == (2, 19, 19) and found.lamp.inner == 2.0
     seen = figures_of(capfd, "render", "two", "--rays", "20000", "-o", "two.png")
     assert seen["of_source"] == pytest.approx(figures["of_source"], abs=0.02)
     vertices, faces = lamp_mesh(found.lamp, found.field, found.values, (40, 90))
@@ -175,6 +193,59 @@ def test_a_project_edited_beyond_its_lens_is_refused(road, capfd):
     assert not Path("x.png").exists()
 
 
+def test_an_interrupted_design_goes_on_after_its_last_complete_stage(road, capfd, monkeypatch):
+    stages = []
+    refine = inverse.refine
+
+    def interrupted(objective, values, iterations, on_iteration):
+        stages.append(len(stages))
+        if len(stages) == 2:
+            raise KeyboardInterrupt
+        return refine(objective, values, iterations, on_iteration)
+
+    monkeypatch.setattr(inverse, "refine", interrupted)
+    assert cli.run(["design", "uniform", *ROAD, "-o", "half"]) == 130
+    capfd.readouterr()
+    assert Project.open("half").load().state.stage == 1 and not Path("half/render.png").exists()
+    figures = figures_of(capfd, "design", "--resume", "half")
+    assert len(stages) == 3 and Path("half/render.png").is_file()
+    one, other = (Project.open(path).load() for path in ("half", road))
+    assert torch.equal(one.state.heights, other.state.heights)
+    assert figures["iterations"] == len(one.state.history) == other.results["iterations"]
+    again = figures_of(capfd, "design", "--resume", "half")
+    assert len(stages) == 3 and again["of_source"] == figures["of_source"]
+
+
+def test_the_same_command_goes_on_with_an_interrupted_design(capfd, monkeypatch):
+    def interrupted(*_arguments, **_more):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as other:
+        other.setattr(LampDesign, "evaluated", interrupted)
+        assert cli.run(["design", "uniform", *ROAD, "-o", "half"]) == 130
+    capfd.readouterr()
+    with monkeypatch.context() as other:
+        other.setattr(inverse, "refine", interrupted)  # all stages are done
+        assert figures_of(capfd, "design", "uniform", *ROAD, "-o", "half")["of_source"] > 0.8
+
+
+def test_lamps_are_designed_rendered_and_exported_from_python(road):
+    lamp = caustic_cli.design("uniform", lamp=15, throw=8000, picture_size=[30000, 10000])
+    assert isinstance(lamp, LampDesign) and torch.equal(lamp.values, caustic_cli.load(road).values)
+    image, figures = caustic_cli.render(lamp, 20_000, seed=3)
+    assert image.sum() == pytest.approx(figures["of_source"]) == pytest.approx(0.84, abs=0.03)
+    assert caustic_cli.render(road, 20_000, seed=3).figures["of_source"] == figures["of_source"]
+    assert lamp.export("a.step").read_text().startswith("ISO-10303-21") and lamp.export("b.obj", samples=(9, 20)).is_file()
+    for what, words in (
+        (lambda: lamp.export("a.dat"), "format is needed"),
+        (lambda: caustic_cli.load(road, source="disc"), "has no other light or screen"),
+        (lambda: caustic_cli.design("uniform", lamp=15, device="cuda", angles=[60, 60]), "on the CPU"),
+        (lambda: caustic_cli.design("uniform", lamp=15, movie="a.gif", angles=[60, 60]), "is for a lens before its light"),
+    ):
+        with pytest.raises(InputError, match=words):
+            what()
+
+
 # Refusals
 
 
@@ -185,6 +256,7 @@ def test_a_project_edited_beyond_its_lens_is_refused(road, capfd):
         (["--lamp", "15", "--screen", "far"], "needs --angles"),
         (["--lamp", "15", "--screen", "floor:1m", "--angles", "60"], "of a lamp must be far"),
         (["--lamp", "15", "--angles", "60", "--throw", "2m"], "leave out its distance"),
+        (["--lamp", "15", "--angles", "60", "--screen-shift", "0,1m"], "leave out its distance, its size and its shift"),
         (["--lamp", "15", "--angles", "200"], "at most 178"),
         (["--lamp", "0", "--angles", "60"], "--lamp must be"),
         (["--lamp", "nan", "--angles", "60"], "--lamp"),
@@ -193,6 +265,7 @@ def test_a_project_edited_beyond_its_lens_is_refused(road, capfd):
         (["--lamp", "6", "--angles", "60", "--lamp-inner", "4"], "--lamp of"),
         (["--lamp", "15", "--angles", "60", "--lamp-surfaces", "3"], "--lamp-surfaces must be"),
         (["--lamp", "15", "--angles", "60", "--chip-shape", "star"], "--chip-shape must be"),
+        (["--lamp", "15", "--angles", "60", "--lamp-flange", "2"], "needs the thickness --lamp-base"),
         (["--lamp", "15", "--angles", "60", "--mag", "3"], "--mag is not a setting of a lamp"),
         (["--lamp", "15", "--angles", "60", "--source", "disc"], "--source is not a setting of a lamp"),
         (["--lamp", "15", "--angles", "60", "--lens-size", "20"], "--lens-size is not a setting of a lamp"),
@@ -219,28 +292,33 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
         (["render", "--effects", "none"], "--effects is for a lens before its light"),
         (["render", "--screen-at", "100"], "--screen-at is for a lens before its light"),
         (["render", "--source", "disc"], "--source is for a lens before its light"),
-        (["render", "--report"], "--report is for a lens before its light"),
+        (["render", "--explain"], "--explain is for a lens before its light"),
+        (["render", "--verify", "mitsuba"], "not installed"),
         (["export"], "a --format is needed"),
         (["export", "-o", "a.dat"], "a --format is needed"),
-        (["export", "--format", "step"], "a lamp's surface is none"),
+        (["export", "--format", "heightmap"], "a lamp's surface is none"),
+        (["export", "--format", "zemax"], "step for programs of optical design"),
+        (["export", "--format", "step", "--samples", "9"], "--samples belongs to stl, ply, obj, 3mf"),
         (["export", "--format", "gcode"], "a lamp's surface is none"),
         (["export", "--format", "stl", "--mould"], "--mould is for a lens before its light"),
-        (["export", "--format", "ies", "--samples", "9"], "--samples belongs to stl, ply, obj"),
+        (["export", "--format", "ies", "--samples", "9"], "--samples belongs to stl, ply, obj, 3mf"),
         (["export", "--format", "stl", "--samples", "1"], "2 to 4000 rings"),
         (["export", "--format", "stl,ply", "-o", "a.stl"], "--out names one file"),
         (["gradmap", "--control", "3,3"], "makes a lamp"),
         (["convergence"], "makes a lamp"),
-        (["design", "--resume"], "makes a lamp"),
+        (["design", "--resume", "--iterations", "9"], "--iterations is for a lens before its light"),
+        (["design", "--resume", "--movie", "a.gif"], "--movie is for a lens before its light"),
     ],
 )
-def test_what_a_lamp_has_not_is_refused_in_one_line(command, words, road, capfd):
+def test_what_a_lamp_has_not_is_refused_in_one_line(command, words, road, capfd, monkeypatch):
+    monkeypatch.setattr(verify, "find_spec", lambda name: None)
     name, *options = command
     assert words in refused(capfd, name, str(road), *options)
 
 
 def test_of_several_formats_none_is_written_where_one_is_refused(road, capfd):
     before = set(Path().iterdir())
-    assert "a lamp's surface is none" in refused(capfd, "export", str(road), "--format", "ldt,step")
+    assert "a lamp's surface is none" in refused(capfd, "export", str(road), "--format", "ldt,gcode")
     assert set(Path().iterdir()) == before
 
 
@@ -272,7 +350,7 @@ def test_the_mesh_is_closed_oriented_and_has_the_volume_of_its_surfaces():
     assert vertices[:, 2].min() == 0.0 and vertices[:, 2].max() == pytest.approx(10.0)
 
 
-@pytest.mark.parametrize("format", ["stl", "ply", "obj"])
+@pytest.mark.parametrize("format", ["stl", "ply", "obj", "3mf"])
 def test_solids_are_written_and_repeated(format, road, capfd):
     figures = figures_of(capfd, "export", str(road), "--format", format, "--samples", "20x60")
     path = Path(figures["file"])
@@ -284,6 +362,73 @@ def test_solids_are_written_and_repeated(format, road, capfd):
         assert int.from_bytes(first[80:84], "little") == 2 * (60 + 19 * 120) + 120
     if format == "obj":
         assert first.count(b"\nv ") == 2 * (1 + 20 * 60)
+
+
+def test_a_foot_is_part_of_the_solid_and_a_step_file_is_repeated(road, capfd):
+    other = road.parent / "foot.caustic"
+    other.mkdir()
+    for file in road.iterdir():
+        (other / file.name).write_bytes(file.read_bytes())
+    text = (road / "project.toml").read_text()
+    (other / "project.toml").write_text(text.replace("[lamp]", "[lamp]\nbase = 1.5\nflange = 2.0"))
+    assert figures_of(capfd, "export", str(other), "--format", "obj", "--samples", "20x60")["file"] == "foot.obj"
+    heights = [float(line.split()[3]) for line in Path("foot.obj").read_text().splitlines() if line.startswith("v ")]
+    assert min(heights) == -1.5
+    figures = figures_of(capfd, "export", str(other), "--format", "step")
+    first = Path("foot.step").read_bytes()
+    assert figures["bytes"] == len(first) and first.count(b"ADVANCED_FACE") == 8
+    assert cli.run(["export", str(other), "--format", "step", "--force", "--quiet"]) == 0
+    assert Path("foot.step").read_bytes() == first
+
+
+def test_a_scene_for_mitsuba_lies_beside_its_meshes(road, capfd):
+    figures = figures_of(capfd, "export", str(road), "--format", "mitsuba", "--samples", "20x60")
+    assert [Path(file).is_file() for file in (figures["file"], *figures["beside"])] == [True] * 4
+    assert figures["file"] == "road.xml" and "road-outer.ply" in Path("road.xml").read_text()
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_a_comparison_with_mitsuba_decides_the_exit_status(agree, road, capfd, monkeypatch):
+    asked = []
+
+    def found(scene, lamp, goal, field, values, pixels, rays, seed):
+        asked.append(rays)
+        assert scene.is_file()
+        image = np.random.default_rng(1).uniform(1.0, 2.0, (9, *pixels)) / 1e4
+        decision = compare(image[:8], image[8], image[8] / 1e5, rays, 0.0, {"mitsuba": "3", "variant": "none"})
+        return replace(decision, figures=decision.figures | {"agree": agree})
+
+    monkeypatch.setattr(workflow, "verify_lamp", found)
+    monkeypatch.setattr(verify, "find_spec", lambda name: True)
+    status = cli.run(["render", str(road), "--verify", "mitsuba", "--rays", "50000", "-o", "a.png"])
+    assert status == (0 if agree else 1) and asked == [50000] and Path("a-verify.png").is_file()
+    assert ("agree" if agree else "DISAGREE") in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("goal", [Goal((3000.0, 1000.0), 2000.0), Goal((120.0, 40.0))])
+def test_the_illuminance_of_a_report_is_flux_over_area_or_solid_angle(goal):
+    """Of all of 1000 lm: lux times square metres, or candela times steradians."""
+    image = np.random.default_rng(2).uniform(size=(60, 20))
+    image *= 0.8 / image.sum()
+    area = 3.0 if not goal.far else math.radians(120.0) * 2.0 * math.sin(math.radians(20.0))
+    assert float((density(goal, image) * goal.shares((60, 20)) * area).sum()) == pytest.approx(800.0)
+
+
+def size_of(path):
+    """Width and height of an image."""
+    with Image.open(path) as image:
+        return image.size
+
+
+def test_a_report_is_drawn_by_design_and_render(road, capfd, monkeypatch):
+    figures = figures_of(capfd, "render", str(road), "--rays", "20000", "--report", "-o", "a.png")
+    assert size_of("a-report.png") == (1500, 800)
+    assert figures["peak_candela"] > 500.0 and len(figures["beam_angles"]) == len(figures["field_angles"]) == 2
+    assert all(field > beam > 30.0 for beam, field in zip(figures["beam_angles"], figures["field_angles"], strict=True))
+    assert figures["beam_angles"][0] > figures["beam_angles"][1]  # the road is long along x
+    monkeypatch.setenv("CAUSTIC_EFFORT", "test report=True lamp_stages=((300,5000,2,0.1),(300,5000,2,0.1))")
+    assert cli.run(["design", "uniform", "--lamp", "15", "--angles", "120x60", "-o", "far", "--quiet"]) == 0
+    assert size_of("far/report.png") == (1500, 800)
 
 
 # Photometry
@@ -352,7 +497,7 @@ def test_an_ldt_file_has_the_lines_of_the_format():
         (b"IES:LM-63-2019\nTILT=NONE\n1 1000 1 9e9 2 1 2 0 0 0\n1 1 0\n", "at most 2000"),
         (b"IES:LM-63-2019\nTILT=NONE\n1 x\n", "damaged"),
         (b"a\n1\n4\n", "damaged"),
-        (b"a\n1\n4\n5\n1\n6\n", "symmetry 4"),
+        (b"a\n1\n7\n5\n1\n6\n", "symmetry 7"),
         (b"\x00" * 4000, "damaged"),
     ],
 )
@@ -363,7 +508,7 @@ def test_damaged_photometric_files_are_refused_in_one_line(content, words):
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-def test_the_values_of_a_checkpoint_are_those_of_log_r(road):
+def test_the_values_of_a_checkpoint_are_those_of_r(road):
     lamp = LampDesign.of(Project.open(road))
     least, greatest = lamp.field.extent(lamp.values)
     assert lamp.lamp.inner + lamp.lamp.wall < least < greatest < 16.0

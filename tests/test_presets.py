@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -33,7 +34,8 @@ def test_every_preset_is_a_whole_scene(name):
     said = settings.read(presets.path_of(name), parameters=True)
     full = complete(said, 1.0, Parameters(**said.pop("")))
     if full.lamp is not None:
-        assert lamp_of(full).radius == 15.0 and goal_of(full).distance == full.screen.z
+        assert lamp_of(full).radius == 15.0
+        assert goal_of(full).distance == (full.screen.z if full.lamp.angles is None else math.inf)
         return
     scene = settings.build_scene(full)
     assert scene.screen.z == full.screen.z and dict(presets.rows())[name].endswith(".")

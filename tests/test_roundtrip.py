@@ -12,6 +12,7 @@ import math
 import re
 import sys
 import types
+import zipfile
 from dataclasses import replace
 from functools import partial
 from xml.etree import ElementTree
@@ -37,6 +38,7 @@ from caustic_cli.export.points import write_csv, write_xyz
 from caustic_cli.export.step import write_step
 from caustic_cli.export.stl import write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid, second_derivative_bounds
+from caustic_cli.export.threemf import write_3mf
 from caustic_cli.export.zemax import write_zemax
 from caustic_cli.io.archive import open_archive
 from caustic_cli.io.files import is_ours
@@ -209,6 +211,26 @@ def test_meshes(tmp_path, lens, rays, capsys, write, suffix):
     if suffix != "stl":
         assert np.abs(z - sample_grid(field, heights, None).z).max() <= {"ply": 0.0, "obj": 0.5e-9}[suffix]
     assert is_ours(path)
+
+
+def test_3mf_is_a_package_of_the_mesh(tmp_path, lens):
+    """By the names of its core specification, with the vertices and triangles of an OBJ file; twice the same bytes."""
+    path, core = tmp_path / "lens.3mf", "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
+    write_3mf(path, *lens, samples=(21, 31))
+    first = path.read_bytes()
+    write_3mf(path, *lens, samples=(21, 31))
+    assert path.read_bytes() == first and is_ours(path)
+    with zipfile.ZipFile(path) as package:
+        assert package.testzip() is None and package.namelist()[0] == "[Content_Types].xml"
+        relation = ElementTree.fromstring(package.read("_rels/.rels"))[0]
+        types = {kind.get("Extension") for kind in ElementTree.fromstring(package.read("[Content_Types].xml"))}
+        model = ElementTree.fromstring(package.read(relation.get("Target")[1:]))
+    assert types == {"rels", "model"} and relation.get("Type").endswith("2013/01/3dmodel") and model.get("unit") == "millimeter"
+    vertices = np.array([[float(v.get(axis)) for axis in "xyz"] for v in model.iter(f"{core}vertex")])
+    faces = np.array([[int(t.get(f"v{k}")) for k in (1, 2, 3)] for t in model.iter(f"{core}triangle")])
+    wanted, triangles = closed_mesh(*lens, samples=(21, 31))
+    assert np.abs(vertices - wanted).max() <= 0.51e-9 and (faces == triangles).all()
+    assert model.find(f"{core}build/{core}item").get("objectid") == model.find(f"{core}resources/{core}object").get("id")
 
 
 @pytest.mark.parametrize("case", [*CASES.values(), CASE], ids=[*CASES, "fine"])

@@ -207,8 +207,8 @@ def test_scenes_are_written_and_compared_as_they_are(how, tmp_path, monkeypatch)
     assert not verify.unsupported(scene)
     other = InItsPlace(scene, field, heights)
     monkeypatch.setitem(sys.modules, "mitsuba", other)
-    monkeypatch.setattr(verify, "_choose_variant", lambda: "none")
-    monkeypatch.setattr(verify, "_follow", other.follow)
+    monkeypatch.setattr(verify, "choose_variant", lambda: "none")
+    monkeypatch.setattr(verify, "follow", other.follow)
     paths = [tmp_path / f"{k}.xml" for k in range(len(scene.bands))]
     for path, band in zip(paths, scene.bands, strict=True):
         write_mitsuba(path, band.scene, field, heights, (17, 17), dark=True)
@@ -275,7 +275,7 @@ def mitsuba():
     if importlib.util.find_spec("mitsuba") is None:
         pytest.skip("Mitsuba is not installed")
     try:
-        return verify._choose_variant()
+        return verify.choose_variant()
     except CausticError as error:
         pytest.skip(str(error))
 
@@ -303,7 +303,7 @@ def test_mitsuba_agrees(mitsuba, tmp_path, source, capsys):
             end="",
         )
     assert decision.agree, decision.figures
-    verify.write_panels(tmp_path / "verify.png", decision, scene)
+    verify.write_panels(tmp_path / "verify.png", decision, scene.screen.half_size)
     assert (tmp_path / "verify.png").read_bytes()[1:4] == b"PNG"
 
 

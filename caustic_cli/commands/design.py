@@ -33,8 +33,8 @@ class DesignOptions(options.Computation):
         Path,
         typer.Argument(
             metavar="TARGET",
-            help="The picture: an image file or a 2-D .npy of irradiance, - for standard input, or uniform or disc where there is"
-            " no such file; with --resume, the project.",
+            help="The picture: an image file or a 2-D .npy of irradiance, - for standard input, or uniform, disc or headlamp where"
+            " there is no such file; of a lamp also the light of a photometric file, .ies or .ldt; with --resume, the project.",
             show_default=False,
         ),
     ]
@@ -96,15 +96,15 @@ def run(asked: DesignOptions) -> None:
             compile_behind(["multigrid"], more=True)
     device = asked.start_torch()
 
-    from caustic_cli.config.lamp import asks_for_lamp  # noqa: PLC0415
+    from caustic_cli.config.lamp import asks_for_lamp, says_lamp  # noqa: PLC0415
     from caustic_cli.inverse import ranks  # noqa: PLC0415
-    from caustic_cli.workflow import library  # noqa: PLC0415
+    from caustic_cli.workflow import lamp, library  # noqa: PLC0415
     from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
-    if not asked.resume and asks_for_lamp(asked.given, asked.preset, asked.config):
-        with _saying_what_is_kept(path):
-            _design_lamp(asked, picture, path)
-        return
+    for_lamp = says_lamp(project) if asked.resume else asks_for_lamp(asked.given, asked.preset, asked.config)
+    if for_lamp:
+        _refuse_for_lamps(asked)
+        device = "cuda" if asked.device == "cuda" else "cpu"
     if asked.plan:
         _print_plan(asked, picture)
         return
@@ -119,31 +119,21 @@ def run(asked: DesignOptions) -> None:
         else:
             how |= {"preset": asked.preset, "config": asked.config, "out": path}
             lens = library.design_of(picture, asked.given, error=asked.error, **how)
-    say.table(lens.figures["project"], console.figures_rows(lens.figures))
+    say.table(lens.figures["project"], (lamp.rows if for_lamp else console.figures_rows)(lens.figures))
     if asked.json:
         console.emit_json(lens.figures)
 
 
-def _design_lamp(asked: DesignOptions, picture: Any, path: Path) -> None:
-    """Design a lamp and print its figures.
+def _refuse_for_lamps(asked: DesignOptions) -> None:
+    """Refuse what no lamp is designed with.
 
     Raises:
-        InputError: an option is given that belongs to a lens with a height field.
+        InputError: several processes, or --plan.
     """
-    from caustic_cli.workflow import lamp  # noqa: PLC0415
-
     if checks.rank_and_size()[1] > 1:
         raise InputError("a lamp is designed by one process, and torchrun has started more")
-    if asked.device == "cuda":
-        raise InputError("a lamp is designed on the CPU: leave out --device cuda")
-    for name in ("movie", "error", "plan"):
-        if getattr(asked, name):
-            raise InputError(f"--{name} is for a lens before its light, not for a lamp around it")
-    how: dict[str, Any] = {"preset": asked.preset, "config": asked.config, "out": path, "force": asked.force, "say": asked.say}
-    figures = lamp.design(picture, asked.given, **how).figures
-    asked.say.table(figures["project"], lamp.rows(figures))
-    if asked.json:
-        console.emit_json(figures)
+    if asked.plan:
+        raise InputError("--plan is for a lens before its light, not for a lamp around it")
 
 
 def _check(asked: DesignOptions) -> None:
@@ -208,6 +198,7 @@ def _check_new(asked: DesignOptions) -> Any:
     from caustic_cli.config.settings import by_section, implied, refuse_unused  # noqa: PLC0415
     from caustic_cli.config.values import refuse_bad_file, refuse_bad_options  # noqa: PLC0415
     from caustic_cli.io.files import read_stdin  # noqa: PLC0415
+    from caustic_cli.io.photometry import SUFFIXES, read_photometry  # noqa: PLC0415
     from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, read_picture  # noqa: PLC0415
 
     given, target = asked.given, asked.target
@@ -221,7 +212,9 @@ def _check_new(asked: DesignOptions) -> Any:
     if asked.config is None and asked.preset is None:
         refuse_unused({"type": default("source.type")} | implied(by_section(given)).get("source", {}), given)
     picture = read_stdin(ACCEPTED, MAX_BYTES) if str(target) == "-" else target
-    if asked.config is None:  # a configuration may set its encoding
+    if target.suffix.lower() in SUFFIXES:
+        read_photometry(target)
+    elif asked.config is None:  # a configuration may set its encoding
         read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
     return picture
 

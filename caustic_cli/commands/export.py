@@ -45,8 +45,8 @@ class ExportOptions(options.OfDesign, options.Debugging):
             "--format",
             metavar="NAME[,NAME...]",
             help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items())
-            + "; of a lamp stl, ply, obj, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's suffix says;"
-            " lighttools]",
+            + "; of a lamp step, stl, ply, obj, 3mf, mitsuba, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's"
+            " suffix says; lighttools]",
         ),
     ] = None
     output: Annotated[
@@ -65,9 +65,9 @@ class ExportOptions(options.OfDesign, options.Debugging):
         float | None,
         typer.Option(
             metavar="MM",
-            help="Largest deviation from the surface.  stl, ply, obj, mitsuba: of the triangles, instead of --samples; heightmap:"
-            " of bilinear interpolation; gcode: of linear moves (a hundredth of the scallops); step: of a spline with as few"
-            " knots as possible, 0 for the exact one; lighttools: 0 for exact numbers.  [default: as --samples]",
+            help="Largest deviation from the surface.  stl, ply, obj, 3mf, mitsuba: of the triangles, instead of --samples;"
+            " heightmap: of bilinear interpolation; gcode: of linear moves (a hundredth of the scallops); step: of a spline"
+            " with as few knots as possible, 0 for the exact one; lighttools: 0 for exact numbers.  [default: as --samples]",
         ),
     ] = None
     max_size: Annotated[
@@ -82,7 +82,7 @@ class ExportOptions(options.OfDesign, options.Debugging):
     mould: Annotated[
         bool,
         typer.Option(
-            "--mould", help="step, stl, ply, obj, heightmap, gcode: the negative form, oriented for machining from above."
+            "--mould", help="step, stl, ply, obj, 3mf, heightmap, gcode: the negative form, oriented for machining from above."
         ),
     ] = False
     block: Annotated[
@@ -151,26 +151,23 @@ def _export_lamp(asked: ExportOptions, path: Path) -> None:
         InputError: an option is given that does not apply to lamps, or a format does not hold them.
     """
     from caustic_cli.project.project import Project  # noqa: PLC0415
-    from caustic_cli.workflow import lamp  # noqa: PLC0415
+    from caustic_cli.workflow import lamp, lamp_formats  # noqa: PLC0415
 
     options.refuse_others(asked, ("format", "output", "samples", "milling"))
     samples = tuple(options.both(options.counts("--samples", asked.samples))) if asked.samples else None
     if asked.format is None:
-        suffix = "" if asked.output is None else asked.output.suffix.lower()
-        formats = [name for name, (own, _, _) in lamp.FORMATS.items() if own == suffix]
-        if not formats:
-            listed = ", ".join(f"{name} ({own})" for name, (own, _, _) in lamp.FORMATS.items())
-            raise InputError(f"of a lamp a --format is needed, or an --out with its suffix, of {listed}")
+        formats = [lamp_formats.format_of("" if asked.output is None else asked.output.suffix)]
     else:
         formats = [name.strip() for name in asked.format.split(",")]
     if asked.output and len(formats) > 1:
         raise InputError("--out names one file; several formats are written beside each other under the project's own name")
     for name in formats:
-        lamp.check_export(name, samples)
+        lamp_formats.check_export(name, samples)
     project, found = Project.open(path), []
     for name in formats:
         found.append(lamp.export(project, name, asked.output, samples, asked.force, asked.say))
-        asked.say.result(f"{found[-1]['file']}: {found[-1]['bytes']:,} bytes")
+        for file in (found[-1]["file"], *found[-1].get("beside", ())):
+            asked.say.result(f"{file}: {Path(file).stat().st_size:,} bytes")
     if asked.json:
         console.emit_json(found[0] if len(formats) == 1 else {"exports": found})
 

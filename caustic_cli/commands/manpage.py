@@ -117,11 +117,12 @@ Fraction of all that the source emits which lands on the picture, and what that 
 or a disc at infinity; all rays of a ray file; for a point, grid or disc its Lambertian or tabulated distribution in all directions,
 and for a uniform one the cone if that is given, else all directions; for several sources that of all together.
 .TP
-.B interior_rms, interior_noise, uniformity, uncoated_limit, least_wall, greatest_radius, peak_candela, beam_angles
-Of a lamp, whose of_source and the entries of lost sum to 1: relative_rms, which is over pixels that are lit entirely, without the
-outer 2.5 % of the target, and its noise; least over mean illuminance, or intensity in the far field; the light that uncoated
-surfaces pass at normal incidence; least distance of its surfaces and greatest radius, mm; in the far field candela for a chip of
-1000 lm, and full
+.B interior_rms, interior_noise, border, uniformity, cut_off, uncoated_limit, least_wall, greatest_radius, peak_candela, beam_angles
+Of a lamp, whose of_source and the entries of lost sum to 1: relative_rms, which is over pixels that are lit entirely, without a
+border of the target, 2.5 % of its smaller side or what a chip blurs, and its noise; that border, mm or degrees; least over mean
+illuminance, or intensity in the far field; there the angle over which it falls from 90 to 10 % at its upper edge; the light that
+uncoated surfaces pass at normal incidence; least distance of its surfaces and greatest radius, mm; in the far field candela for a
+chip of 1000 lm, and full
 angles with half of the peak or more in the planes of x and of y. flux and peak_candela of a photometric file are for 1000 lm, too.
 .TP
 .B wave_relative_rms, wave_psnr_db, wave_ssim, wave_on_screen, wave_on_target, wave_in_black, resolvable

@@ -114,7 +114,7 @@ class OutputOptions(options.Given):
             "--report",
             help="Also report the manufacturing data of the lens: wall, stock, slopes, concave"
             " radius, margin to internal reflection, sharpness, tolerances; writes report.json"
-            " beside the image.",
+            " beside the image.  Of a lamp, isolux lines, polar diagram, sections and losses: report.png.",
         ),
     ] = False
     tool_radius: Annotated[
@@ -206,12 +206,21 @@ def run(asked: RenderOptions) -> None:
         output.show(figures, say)
     if asked.json:
         console.emit_json(figures)
+    _refuse_disagreement(asked, figures)
+
+
+def _refuse_disagreement(asked: RenderOptions, figures: dict[str, Any]) -> None:
+    """Refuse an image that is not Mitsuba's.
+
+    Raises:
+        CausticError: they disagree.
+    """
     if asked.verify and not figures["verify"]["agree"]:
         raise CausticError(f"the image and Mitsuba's disagree by more than noise; see {figures['verify']['image']}")
 
 
 #: Options that apply to lamps.
-OF_LAMPS = ("rays", "output", "npy")
+OF_LAMPS = ("rays", "output", "npy", "verify", "report")
 
 
 def _render_lamp(asked: RenderOptions, rays: int | None) -> None:
@@ -221,13 +230,20 @@ def _render_lamp(asked: RenderOptions, rays: int | None) -> None:
         InputError: an option is given that belongs to a lens with a height field.
     """
     from caustic_cli.project.project import Project  # noqa: PLC0415
+    from caustic_cli.studies import verify  # noqa: PLC0415
     from caustic_cli.workflow import lamp  # noqa: PLC0415
 
     options.refuse_others(asked, OF_LAMPS)
-    figures = lamp.render(Project.open(asked.project), rays, asked.seed, asked.output, asked.npy, asked.force, asked.say)
+    if asked.verify and (why := verify.not_installed()):
+        raise InputError(why)
+    where = (asked.output, asked.npy, asked.force, asked.say, asked.verify is not None, asked.report)
+    figures = lamp.render(Project.open(asked.project), rays, asked.seed, *where)
     asked.say.table(str(asked.project), lamp.rows(figures))
+    if asked.verify:
+        asked.say.table("Mitsuba", verify.rows(figures["verify"]))
     if asked.json:
         console.emit_json(figures)
+    _refuse_disagreement(asked, figures)
 
 
 def _checked_size(asked: RenderOptions) -> list[int]:

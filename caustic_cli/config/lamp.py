@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ INNER, MATERIAL = {1: 4.0 / 15.0, 2: 2.0 / 15.0}, "PMMA"
 #: The settings of other sections that a lamp has; parameters have no section.
 TAKEN = {
     "lens": ("index", "glass", "wavelength"),
-    "screen": ("z",),
+    "screen": ("z", "shift"),
     "target": ("file", "size", "encoding", "flip"),
     "design": ("seed", "start"),
 }
@@ -61,6 +60,9 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
     if lamp.radius is None:
         raise InputError(f"⟨lamp.{next(iter(given['lamp']))}⟩ belongs to a lamp, which ⟨+lamp.radius⟩ makes")
     check_all("lamp", lamp, *lamp)
+    extent = ["chip"] if any(lamp.chip) else []
+    if "file" in lamp and (others := [*extent, *(key for key in ("shape", "intensity") if key in lamp)]):
+        raise InputError(f"⟨lamp.file⟩ holds where and how the chip emits: leave out ⟨lamp.{others[0]}⟩")
     lamp = lamp.filled(inner=INNER[lamp.surfaces] * lamp.radius)
     lens = LensSettings(given.get("lens", {}))
     lens = lens if {"index", "glass"} & {*lens} else lens.filled(glass=MATERIAL)
@@ -78,10 +80,13 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
         size = by.get("picture_size", target.get("size"))
         target = target.changed(size=(size[0], size[1] if len(size) == 2 else size[0] * aspect))
         z = by.get("throw", given.get("screen", {}).get("z", default("screen.z")))
-        screen = ScreenSettings({"z": z})
+        screen = ScreenSettings({**given.get("screen", {}), "z": z})
         check("target.size", target.size)
-    elif "picture_size" in by or "size" in target or "throw" in by or "z" in given.get("screen", {}):
-        raise InputError("⟨lamp.angles⟩ places the picture in the far field: leave out its distance and its size on a screen")
+        check("screen.shift", screen.shift)
+    elif "picture_size" in by or "size" in target or "throw" in by or given.get("screen", {}):
+        raise InputError(
+            "⟨lamp.angles⟩ places the picture in the far field: leave out its distance, its size and its shift on a screen"
+        )
     check_all("target", target, *({"flip", "encoding"} & {*target}))
     design = DesignSettings({"seed": default("design.seed"), **given.get("design", {}), "start": "transport"})
     full = Settings(SourceSettings(), lens, screen, target, design, lamp=lamp)
@@ -115,8 +120,12 @@ def lamp_of(settings: Settings) -> Lamp:
     """
     s = settings.lamp
     assert s is not None and s.radius is not None and s.inner is not None
-    chip = Chip("point") if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip)
-    return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall, s.surfaces)
+    table, rays = (getattr(file, "content", None) for file in (s.intensity, s.file))
+    if rays is not None:
+        chip = Chip.of_rays(rays)
+    else:
+        chip = Chip(intensity=table) if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip, table)
+    return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall, s.surfaces, s.base, s.flange)
 
 
 def goal_of(settings: Settings) -> Goal:
@@ -127,4 +136,5 @@ def goal_of(settings: Settings) -> Goal:
     """
     s = settings.lamp
     assert s is not None
-    return Goal(settings.target.size, settings.screen.z) if s.angles is None else Goal(s.angles, math.inf)
+    shift = settings.screen.shift
+    return Goal(settings.target.size, settings.screen.z, shift) if s.angles is None else Goal(s.angles)

@@ -14,15 +14,16 @@ FORMATS = {
     "stl": (".stl", "stl", "closed mesh"),
     "ply": (".ply", "ply", "closed mesh"),
     "obj": (".obj", "obj", "closed mesh"),
+    "3mf": (".3mf", "threemf", "closed mesh"),
     "csv": (".csv", "points", "points of the exit surface"),
     "xyz": (".xyz", "points", "points of the exit surface"),
     "heightmap": (".tif", "heightmap", "32-bit TIFF, or .png of 16 bits, with a JSON of its scale"),
     "gcode": (".nc", "milling.gcode", "program for a three-axis mill"),
     "mitsuba": (".xml", "mitsuba", "the whole scene for Mitsuba 3, ready to run, with two meshes beside it"),
 }
-MESHES = ("stl", "ply", "obj", "mitsuba")
+MESHES = ("stl", "ply", "obj", "3mf", "mitsuba")
 #: Formats of solids, in which a mirror gets a back; formats in the orientation of machining; and formats that support moulds.
-SOLIDS, AS_CUT = ("step", "stl", "ply", "obj"), ("heightmap", "gcode")
+SOLIDS, AS_CUT = ("step", "stl", "ply", "obj", "3mf"), ("heightmap", "gcode")
 MOULDS = (*SOLIDS, *AS_CUT)
 #: Formats with a tolerance, and formats without samples.
 WITHIN, UNSAMPLED = (*MESHES, "lighttools", "step", "heightmap", "gcode"), ("step", "gcode")

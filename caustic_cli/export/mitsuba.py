@@ -73,7 +73,7 @@ class _Flat(NamedTuple):
     files: tuple[str, ...] = ()
 
 
-def _beside(path: str | Path, name: str) -> Path:
+def beside(path: str | Path, name: str) -> Path:
     """The mesh file of a part of a scene."""
     return Path(path).with_name(f"{Path(path).stem}-{name}.ply")
 
@@ -84,7 +84,7 @@ def companions(path: str | Path, scene: Scene) -> list[Path]:
     names = [*_OPTICS[scene.lens.kind][0](scene)]
     for k, element in enumerate(scene.elements):
         names += [surface_name(k, side) for side in element.sides] + [f"element-{k + 1}-black"]
-    return [_beside(path, name) for name in names]
+    return [beside(path, name) for name in names]
 
 
 def write_mitsuba(
@@ -118,7 +118,7 @@ def _lens_files(scene: Scene) -> list[str]:
 def _lens(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]) -> list[str]:
     """The scene of a lens with these free-form sides, after writing its meshes."""
     lens, (*fronts, surface) = scene.lens, sides
-    glass, onto, flat = _glass(lens.index), _onto(scene), _FLATS[lens.aperture]
+    glass, onto, flat = dielectric(lens.index), _onto(scene), _FLATS[lens.aperture]
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     rim = points[rim_of(*surface.points.shape[:2])]
     if fronts:
@@ -126,17 +126,17 @@ def _lens(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]) 
     else:
         refuse_open(float(surface.points[..., 2].min()), lens.z_in)
         low, entrance = rim * [1.0, 1.0, 0.0] + [0.0, 0.0, lens.z_in], _flat_entrance(lens, flat.shape, glass)
-    write_mesh(_beside(path, "exit"), points, triangles(surface.points), normals)
-    write_mesh(_beside(path, "sides"), *_strip(rim, low))
+    write_mesh(beside(path, "exit"), points, triangles(surface.points), normals)
+    write_mesh(beside(path, "sides"), *_strip(rim, low))
     before = max(float(points[:, 2].max()), *(e.extent[1] for e in scene.behind), -math.inf)
     return [
-        *_camera(scene, before, onto, len(System.of(scene).elements) + 2),
+        *camera(scene.screen, _facing(scene), before, onto, len(System.of(scene).elements) + 2),
         *entrance,
-        f'<shape type="ply" id="exit">{_file(path, "exit")}{glass}</shape>',
-        f'<shape type="ply" id="sides">{_file(path, "sides")}<boolean name="face_normals" value="true"/>{BLACK}</shape>',
+        f'<shape type="ply" id="exit">{file_of(path, "exit")}{glass}</shape>',
+        f'<shape type="ply" id="sides">{file_of(path, "sides")}<boolean name="face_normals" value="true"/>{BLACK}</shape>',
         *flat.holder(path, lens),
         *_others(path, scene),
-        *_screen(scene, onto),
+        *screen_shape(scene.screen, _facing(scene), onto),
         *light,
     ]
 
@@ -151,14 +151,14 @@ def _flat_entrance(lens: Lens, shape: str, glass: str) -> list[str]:
 def _free_entrance(path: Path, front: Patch, glass: str) -> tuple[np.ndarray, list[str]]:
     """Border points (k, 3) mm of a free-form entrance, and its shape, after writing its mesh."""
     points = front.points.reshape(-1, 3)
-    write_mesh(_beside(path, "entrance"), points, triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3))
-    shape = [f'<shape type="ply" id="entrance">{_file(path, "entrance")}{glass}</shape>']
+    write_mesh(beside(path, "entrance"), points, triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3))
+    shape = [f'<shape type="ply" id="entrance">{file_of(path, "entrance")}{glass}</shape>']
     return points[rim_of(*front.points.shape[:2])], shape
 
 
-def _file(path: Path, name: str) -> str:
+def file_of(path: Path, name: str) -> str:
     """Reference to the mesh of a part."""
-    return f'<string name="filename" value={quoteattr(_beside(path, name).name)}/>'
+    return f'<string name="filename" value={quoteattr(beside(path, name).name)}/>'
 
 
 #: Densities of files of at most `limit` bytes in all, the smallest first.
@@ -184,23 +184,23 @@ def _others(path: Path, scene: Scene) -> list[str]:
         outer = rims[0] * [FRAME, FRAME, 1.0]
         frame, around = _strip(outer, rims[0])
         across, down = _strip(rims[1], rims[0])
-        write_mesh(_beside(path, black), body.placed(np.concatenate([frame, across])), np.concatenate([around, down + len(frame)]))
+        write_mesh(beside(path, black), body.placed(np.concatenate([frame, across])), np.concatenate([around, down + len(frame)]))
         coating = _COATINGS[body.component.kind](body.component.index)
         for side, seen in zip(body.component.sides, sides, strict=False):
             name = surface_name(body.number, side)
             faces, normals = triangles(seen.points), seen.normals.reshape(-1, 3)
             if side == "front":  # normals out of the glass, or towards the light
                 faces, normals = faces[:, ::-1], -normals
-            write_mesh(_beside(path, name), body.placed(seen.points.reshape(-1, 3)), faces, body.turned(normals))
-            lines.append(f'<shape type="ply" id="{name}">{_file(path, name)}{coating}</shape>')
+            write_mesh(beside(path, name), body.placed(seen.points.reshape(-1, 3)), faces, body.turned(normals))
+            lines.append(f'<shape type="ply" id="{name}">{file_of(path, name)}{coating}</shape>')
         lines.append(
-            f'<shape type="ply">{_file(path, black)}'
+            f'<shape type="ply">{file_of(path, black)}'
             f'<boolean name="face_normals" value="true"/><bsdf type="twosided">{BLACK}</bsdf></shape>'
         )
     return lines
 
 
-def _glass(index: float) -> str:
+def dielectric(index: float) -> str:
     return f'<bsdf type="dielectric"><float name="int_ior" value="{real(index)}"/><float name="ext_ior" value="1"/></bsdf>'
 
 
@@ -214,12 +214,12 @@ def _mirror(path: Path, scene: Scene, sides: tuple[Patch, ...], light: list[str]
     if not scene.source.collimated:
         refuse_obstructed(scene, designed=True)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
-    write_mesh(_beside(path, "mirror"), points, triangles(surface.points)[:, ::-1], -normals)  # towards the light
+    write_mesh(beside(path, "mirror"), points, triangles(surface.points)[:, ::-1], -normals)  # towards the light
     before = min(float(points[:, 2].min()), lens.z_in) - BEFORE
     return [
-        *_camera(scene, before),
-        f'<shape type="ply" id="mirror">{_file(path, "mirror")}{MIRRORED}</shape>',
-        *_screen(scene),
+        *camera(scene.screen, _facing(scene), before),
+        f'<shape type="ply" id="mirror">{file_of(path, "mirror")}{MIRRORED}</shape>',
+        *screen_shape(scene.screen, _facing(scene)),
         *(line.replace("</shape>", '<bsdf type="null"/></shape>') for line in light),
     ]
 
@@ -238,13 +238,14 @@ def _facing(scene: Scene) -> bool:
     return sum(map(mul, scene.undeviated, scene.screen.axes[2])) > 0
 
 
-def _camera(scene: Scene, before: float, onto: str = "", depth: int = DEPTH) -> list[str]:
+def camera(screen: Screen, facing: bool, before: float, onto: str = "", depth: int = DEPTH) -> list[str]:
     """First lines of the scene: integrator, and a camera on the normal of the screen, on the side of the light, whose image the
-    screen fills; before: z of the axis from which its plane is away; onto: transformation to a folded axis."""
-    screen, (sx, sy), (x, y, z) = scene.screen, scene.screen.half_size, scene.screen.centre
+    screen fills; facing: whether that normal is along the light; before: z of the axis from which its plane is away; onto:
+    transformation to a folded axis."""
+    (sx, sy), (x, y, z) = screen.half_size, screen.centre
     away = 0.9 * abs(sum(map(mul, (x, y, z - before), screen.axes[2])))
     seen = f'<scale x="-1"/><translate z="{real(-away)}"/>'
-    if not _facing(scene):
+    if not facing:
         seen = f'<rotate y="1" angle="180"/><translate z="{real(away)}"/>'
     width, height = screen.resolution[0], max(1, round(screen.resolution[0] * sy / sx))
     return [
@@ -263,13 +264,13 @@ def _camera(scene: Scene, before: float, onto: str = "", depth: int = DEPTH) -> 
     ]
 
 
-def _screen(scene: Scene, onto: str = "") -> list[str]:
-    """White rectangle that faces its light; onto: transformation to a folded axis."""
-    (sx, sy), spin = scene.screen.half_size, SPIN if _facing(scene) else ""
+def screen_shape(screen: Screen, facing: bool, onto: str = "") -> list[str]:
+    """White rectangle that faces its light; facing, onto: as of `camera`."""
+    (sx, sy), spin = screen.half_size, SPIN if facing else ""
     return [
         '<shape type="rectangle" id="screen">',
         '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
-        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/>{_stood(scene.screen)}{onto}</transform>',
+        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/>{_stood(screen)}{onto}</transform>',
         "</shape>",
     ]
 
@@ -323,15 +324,15 @@ def _round_holder(path: Path, lens: Lens) -> list[str]:
     widths = [1.0, 1.05, 1.25, 2.0, 6.0, WIDE]
     parts = [_strip(inner * [a, a, 1.0], inner * [b, b, 1.0]) for a, b in itertools.pairwise(widths)]
     faces = np.concatenate([f + k * 2 * RING for k, (_, f) in enumerate(parts)])
-    write_mesh(_beside(path, "holder"), np.concatenate([v for v, _ in parts]), faces)
-    return [f'<shape type="ply" id="holder">{_file(path, "holder")}{BLACK}</shape>']
+    write_mesh(beside(path, "holder"), np.concatenate([v for v, _ in parts]), faces)
+    return [f'<shape type="ply" id="holder">{file_of(path, "holder")}{BLACK}</shape>']
 
 
 #: Flat entrances by the name of the aperture.
 _FLATS = {Aperture.name: _Flat("rectangle", _holder), CircularAperture.name: _Flat("disk", _round_holder, ("holder",))}
 #: By the kind of the lens: names of its meshes and its scene; by the kind of an element: what covers its surfaces.
 _OPTICS = {"lens": (_lens_files, _lens), "mirror": (lambda _scene: ["mirror"], _mirror)}
-_COATINGS = {"lens": _glass, "mirror": lambda _index: MIRRORED}
+_COATINGS = {"lens": dielectric, "mirror": lambda _index: MIRRORED}
 
 
 def _light(scene: Scene) -> list[str]:

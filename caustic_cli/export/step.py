@@ -17,7 +17,7 @@ each face, faces, shell, solid; then the product.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -97,7 +97,7 @@ class Entities:
     def curve(self, degree: int, points: list[str], knots: np.ndarray) -> str:
         return self.add(
             f"B_SPLINE_CURVE_WITH_KNOTS('',{degree},({','.join(points)}),.UNSPECIFIED.,.F.,.F.,"
-            f"{','.join(_knots(knots))},.UNSPECIFIED.)"
+            f"{','.join(knot_lists(knots))},.UNSPECIFIED.)"
         )
 
     def edge(self, a: str, b: str, curve: str) -> str:
@@ -105,7 +105,7 @@ class Entities:
 
     def bound(self, edges: list[tuple[str, bool]], outer: bool = True) -> str:
         """A loop of edges, each as it is or reversed."""
-        edges = edges if self.up > 0 else _reversed(edges)
+        edges = edges if self.up > 0 else turned(edges)
         loop = [self.add(f"ORIENTED_EDGE('',*,*,{edge},{'.T.' if forward else '.F.'})") for edge, forward in edges]
         closed = self.add(f"EDGE_LOOP('',({','.join(loop)}))")
         return self.add(f"FACE_{'OUTER_' if outer else ''}BOUND('',{closed},.T.)")
@@ -118,11 +118,13 @@ class Entities:
 
 @dataclass(frozen=True)
 class Loop:
-    """Corners (mm) and their vertices, counter-clockwise from +z, and the edges between them with their orientation."""
+    """Corners (mm) and their vertices, counter-clockwise from +z, the edges between them with their orientation, and their curves,
+    of a ring."""
 
     corners: list[np.ndarray]
     vertices: list[str]
     edges: list[tuple[str, bool]]
+    curves: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +180,7 @@ def write_step(
         found.append(lens_solid(out, solid.lens, solid.field, solid.heights))
     out.pose = Pose()
     digit = 0.0 if decimals is None else 10.0 ** (1 - decimals)
-    _product(out, found, max(digit, *(OUTLINES[body.aperture].uncertainty for body in (scene.lens, *scene.elements))))
+    product(out, found, max(digit, *(OUTLINES[body.aperture].uncertainty for body in (scene.lens, *scene.elements))))
     with atomic_file(path, "ascii") as file:
         file.write(HEAD)
         file.writelines(out.lines)
@@ -248,7 +250,7 @@ def _spline_surface(out: Entities, field: HeightField, poles: np.ndarray) -> tup
     control = ",".join("(" + ",".join(row) + ")" for row in points)
     surface = out.add(
         f"B_SPLINE_SURFACE_WITH_KNOTS('',{su.degree},{sv.degree},({control}),.UNSPECIFIED.,.F.,.F.,.F.,"
-        f"{','.join(_knots(su.knots.numpy(), sv.knots.numpy()))},.UNSPECIFIED.)"
+        f"{','.join(knot_lists(su.knots.numpy(), sv.knots.numpy()))},.UNSPECIFIED.)"
     )
     return surface, points
 
@@ -262,20 +264,20 @@ def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor) -
         front = entrance_of(lens)
         entrance, foot, _ = _trimmed(out, outline, front.field, front.heights + z_in)
         faces += outline.walls(out, lens.opening, rim, foot)
-        faces.append(out.face(entrance, out.bound(_reversed(foot.edges)), along=False))
-        return _closed(out, faces)
+        faces.append(out.face(entrance, out.bound(turned(foot.edges)), along=False))
+        return closed(out, faces)
     wide = lens.opening.grown(lens.border)
     if lens.border > 0:
         high = z_in + FLANGE * (lowest - z_in)
         inner, upper = outline.flat(out, lens.opening, high), outline.flat(out, wide, high)
         faces += outline.walls(out, lens.opening, rim, inner)
         flange = out.plane((0.0, 0.0, high), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
-        faces.append(out.face(flange, out.bound(upper.edges), out.bound(_reversed(inner.edges), False)))
+        faces.append(out.face(flange, out.bound(upper.edges), out.bound(turned(inner.edges), False)))
     foot = outline.flat(out, wide, z_in)
     faces += outline.walls(out, wide, upper, foot)
     entrance = out.plane((0.0, 0.0, z_in), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
-    faces.append(out.face(entrance, out.bound(_reversed(foot.edges))))
-    return _closed(out, faces)
+    faces.append(out.face(entrance, out.bound(turned(foot.edges))))
+    return closed(out, faces)
 
 
 def _trimmed(out: Entities, outline: Polygon, field: HeightField, heights: Tensor) -> tuple[str, Loop, float]:
@@ -284,7 +286,7 @@ def _trimmed(out: Entities, outline: Polygon, field: HeightField, heights: Tenso
     return surface, *outline.rim(out, field, heights, poles, points)
 
 
-def _closed(out: Entities, faces: list[str]) -> str:
+def closed(out: Entities, faces: list[str]) -> str:
     """The solid between faces."""
     shell = out.add(f"CLOSED_SHELL('',({','.join(faces)}))")
     return out.add(f"MANIFOLD_SOLID_BREP('lens',{shell})")
@@ -332,15 +334,7 @@ class Polygon:
 
     def walls(self, out: Entities, aperture: Aperture, upper: Loop, lower: Loop) -> list[str]:
         """Vertical faces between two loops over the outline of an aperture."""
-        posts = [
-            (out.edge(a, b, out.line(p, q)), True)
-            for a, b, p, q in zip(lower.vertices, upper.vertices, lower.corners, upper.corners, strict=True)
-        ]
-        faces = []
-        for k, (surface, post) in enumerate(zip(self._sides(out, aperture, lower), posts, strict=True)):
-            back = _reversed([upper.edges[k]]) + _reversed([post])  # along the foot, up, back along the top, down
-            faces.append(out.face(surface, out.bound([lower.edges[k], posts[(k + 1) % len(posts)], *back])))
-        return faces
+        return walls(out, self._sides(out, aperture, lower), upper, lower)
 
     def _sides(self, out: Entities, aperture: Aperture, lower: Loop) -> Iterator[str]:
         """The surfaces of the sides."""
@@ -356,26 +350,14 @@ class Circle(Polygon):
         self, out: Entities, field: HeightField, heights: Tensor, poles: np.ndarray, points: list[list[str]]
     ) -> tuple[Loop, float]:
         """As of a polygon: two interpolating cubic curves within ROUND_UNCERTAINTY / 10."""
-        radius, count, off = field.half_size[0], 8 * max(field.shape), np.inf
+        radius = field.half_size[0]
 
         def on(t: np.ndarray) -> np.ndarray:
             x, y = radius * np.cos(t), radius * np.sin(t)
             z = field.at(heights, *map(torch.from_numpy, (x, y)), [(0, 0)])[0].numpy()
             return np.stack([x, y, z], -1)
 
-        while off > 0.1 * ROUND_UNCERTAINTY and count <= MOST_ON_RIM:
-            lines = [np.linspace(k * np.pi, (k + 1) * np.pi, count + 1) for k in (0, 1)]
-            curves = [make_interp_spline(t, on(t)) for t in lines]
-            middle = [(0.5 * (t[1:] + t[:-1])) for t in lines]
-            off = max(float(np.abs(c(t) - on(t)).max()) for c, t in zip(curves, middle, strict=True))
-            count *= 2
-        corners = [on(np.array([0.0]))[0], on(np.array([np.pi]))[0]]
-        vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
-        edges = [
-            (out.edge(vertices[k], vertices[1 - k], out.curve(3, [out.point(p) for p in c.c], c.t)), True)
-            for k, c in enumerate(curves)
-        ]
-        return Loop(corners, vertices, edges), min(float(c.c[:, 2].min()) for c in curves)
+        return ring(out, on, 8 * max(field.shape))
 
     def _corners(self, aperture: Aperture) -> list[tuple[float, float]]:
         return [(aperture.half_size[0], 0.0), (-aperture.half_size[0], 0.0)]
@@ -390,15 +372,49 @@ class Circle(Polygon):
         yield from (cylinder, cylinder)
 
 
+def ring(out: Entities, on: Callable[[np.ndarray], np.ndarray], count: int) -> tuple[Loop, float]:
+    """A closed curve as two interpolating cubic splines within ROUND_UNCERTAINTY / 10, and the least height of their poles, mm.
+
+    on: points (N, 3) mm at angles t (N,), 0 to 2 pi, counter-clockwise from +z; count: points of each at first.
+    """
+    off = np.inf
+    while off > 0.1 * ROUND_UNCERTAINTY and count <= MOST_ON_RIM:
+        lines = [np.linspace(k * np.pi, (k + 1) * np.pi, count + 1) for k in (0, 1)]
+        curves = [make_interp_spline(t, on(t)) for t in lines]
+        middle = [(0.5 * (t[1:] + t[:-1])) for t in lines]
+        off = max(float(np.abs(c(t) - on(t)).max()) for c, t in zip(curves, middle, strict=True))
+        count *= 2
+    corners = [on(np.array([0.0]))[0], on(np.array([np.pi]))[0]]
+    vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
+    drawn = tuple(out.curve(3, [out.point(p) for p in c.c], c.t) for c in curves)
+    edges = [(out.edge(vertices[k], vertices[1 - k], curve), True) for k, curve in enumerate(drawn)]
+    return Loop(corners, vertices, edges, drawn), min(float(c.c[:, 2].min()) for c in curves)
+
+
+def walls(out: Entities, sides: Iterable[str], upper: Loop, lower: Loop, along: bool = True) -> list[str]:
+    """Vertical faces of these surfaces between two loops with as many corners; along: as of `Entities.face`."""
+    posts = [
+        (out.edge(a, b, out.line(p, q)), True)
+        for a, b, p, q in zip(lower.vertices, upper.vertices, lower.corners, upper.corners, strict=True)
+    ]
+    faces = []
+    for k, (surface, post) in enumerate(zip(sides, posts, strict=True)):
+        back = turned([upper.edges[k]]) + turned([post])  # along the foot, up, back along the top, down
+        bound = [lower.edges[k], posts[(k + 1) % len(posts)], *back]
+        faces.append(out.face(surface, out.bound(bound if along else turned(bound)), along=along))
+    return faces
+
+
 #: Outlines of solids by the name of the aperture.
 OUTLINES = {Aperture.name: Polygon(), CircularAperture.name: Circle()}
 
 
-def _reversed(edges: list[tuple[str, bool]]) -> list[tuple[str, bool]]:
+def turned(edges: list[tuple[str, bool]]) -> list[tuple[str, bool]]:
+    """A loop the other way round."""
     return [(edge, not forward) for edge, forward in edges[::-1]]
 
 
-def _product(out: Entities, solids: list[str], uncertainty: float) -> None:
+def product(out: Entities, solids: list[str], uncertainty: float) -> None:
     """Write units, and the product with the shape of the solids."""
     millimetre = out.add("(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.MILLI.,.METRE.))")
     radian = out.add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
@@ -423,7 +439,7 @@ def _product(out: Entities, solids: list[str], uncertainty: float) -> None:
     out.add(f"SHAPE_DEFINITION_REPRESENTATION({described},{shape})")
 
 
-def _knots(*vectors: np.ndarray) -> Iterator[str]:
+def knot_lists(*vectors: np.ndarray) -> Iterator[str]:
     """Multiplicities of every knot vector, then their distinct knots."""
     found = [np.unique(t, return_counts=True) for t in vectors]
     yield from (f"({','.join(map(str, counts))})" for _, counts in found)

@@ -131,16 +131,20 @@ class _Inverse(torch.autograd.Function):
 
 
 class InverseLaplacian:
-    """y (.., n, m) -> C_u^T (s o y) C_v, the coordinates in which the caustic's response is well conditioned."""
+    """y (.., n, m) -> C_u^T (s o y) C_v, the coordinates in which the caustic's response is well conditioned.
 
-    def __init__(self, like: Tensor):
+    mean: factor s of the mean, which does not affect the image of one surface, relative to that of the longest wave.
+    """
+
+    def __init__(self, like: Tensor, mean: float = 0.0):
         n, m = like.shape[-2:]
         if like.device.type != "cpu":
             self.cu, self.cv = cosine_transform(n).to(like), cosine_transform(m).to(like)
         lam = [4.0 * torch.sin(0.5 * math.pi * torch.arange(k).to(like) / k) ** 2 for k in (n, m)]
         total = lam[0][:, None] + lam[1][None, :]
-        total[0, 0] = math.inf  # the mean height does not affect the image: keep it
+        total[0, 0] = math.inf
         self.scale = float(lam[0][1] + lam[1][1]) / total
+        self.scale[0, 0] = mean
 
     def __call__(self, y: Tensor) -> Tensor:
         scaled = self.scale * y

@@ -17,13 +17,12 @@ a smooth function of any direction x, and so defined beyond the light.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.lamp import lambertian
+from caustic_cli.optics.lamp import LAMBERTIAN, emitted
 from caustic_cli.optics.surfaces.polarfield import PolarField, Vectors, direction_of
+from caustic_cli.scene.lamp import Chip
 
 #: Cells of the source along u and v.
 CELLS = 44
@@ -34,13 +33,13 @@ FIRST, LAST, FACTOR, EACH, FINAL = 0.3, 3e-3, 0.6, 8, 40
 CHUNK = 512
 
 
-def source_directions(cells: int = CELLS) -> tuple[Tensor, Tensor]:
-    """Directions (N, 3) of a Lambertian point on a grid of stereographic coordinates, and its light there (N,), of sum 1."""
+def source_directions(cells: int = CELLS, chip: Chip = LAMBERTIAN) -> tuple[Tensor, Tensor]:
+    """Directions (N, 3) of a point of a chip on a grid of stereographic coordinates, and its light there (N,), of sum 1."""
     u = (2.0 * torch.arange(cells, dtype=torch.float64) + 1.0) / cells - 1.0
     u, v = (c.reshape(-1) for c in torch.meshgrid(u, u, indexing="ij"))
     lit = u * u + v * v < 1.0
     u, v = u[lit], v[lit]
-    weight = lambertian(u, v)
+    weight = emitted(chip, u, v)
     return torch.stack(direction_of(u, v), 1), weight / weight.sum()
 
 
@@ -73,18 +72,21 @@ def envelope(directions: Vectors, y: Tensor, b: Tensor, g: Tensor, e: float, ind
     return torch.cat(out)
 
 
-def transported(field: PolarField, y: Tensor, b: Tensor, index: float, radius: float, cells: int = CELLS) -> Tensor:
-    """Control values (n, m) of log r of the refractor that sends the light of a Lambertian point to a target.
+def transported(
+    field: PolarField, y: Tensor, b: Tensor, index: float, radius: float, cells: int = CELLS, chip: Chip = LAMBERTIAN
+) -> Tensor:
+    """Control values (n, m) of r of the refractor that sends the light of a point of a chip to a target.
 
     Args:
         y, b: the target, as for `refractor_potential`.
         radius: greatest r towards the lit hemisphere, mm.
         cells: of the source along u and v.
     """
-    x, a = source_directions(cells)
+    x, a = source_directions(cells, chip)
     g, e = refractor_potential(x, a, y, b, index)
     u, v = field.net.control_xy()
     u, v = (c.reshape(-1) for c in torch.meshgrid(u, v, indexing="ij"))
-    values = field.net.interpolated(envelope(direction_of(u, v), y, b, g, e, index).view(field.shape))
+    log_r = envelope(direction_of(u, v), y, b, g, e, index)
+    values = field.net.interpolated((log_r - log_r.max()).exp().view(field.shape))
     lit = u * u + v * v <= 1.0
-    return values - float(values.reshape(-1)[lit].max()) + math.log(radius)
+    return radius / float(values.reshape(-1)[lit].max()) * values

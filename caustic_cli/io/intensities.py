@@ -1,4 +1,5 @@
-"""Reader of tabulated intensity distributions: text of two columns, degrees from the axis and relative intensity."""
+"""Reader of tabulated intensity distributions: text of two columns, degrees from the axis and relative intensity, or a photometric
+file that is symmetric about its axis."""
 
 from __future__ import annotations
 
@@ -6,15 +7,51 @@ import math
 import re
 
 from caustic_cli.errors import InputError
+from caustic_cli.io.photometry import SUFFIXES, Photometry, parse_photometry
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 
 #: Largest file read.
 MOST_BYTES = 1 << 24
-TABLE = "a .csv of two columns is needed: degrees from +z, ascending from 0, and relative intensity"
+TABLE = (
+    "a .csv of two columns is needed, degrees from +z, ascending from 0, and relative intensity, or a photometric file, .ies or"
+    " .ldt"
+)
+#: Largest difference of the planes of a symmetric photometric file from their mean, over its peak.
+SYMMETRIC = 0.05
 
 
 def parse_distribution(data: bytes, where: str) -> Distribution:
-    """Parse the contents of a file: a header line is optional; columns are separated by commas, semicolons or blanks; # begins a
+    """Parse the contents of a file, by the suffix of its name.
+
+    Raises:
+        InputError: naming `where`.
+    """
+    if where.lower().endswith(SUFFIXES):
+        return _mean(parse_photometry(data, where), where)
+    return _table(data, where)
+
+
+def _mean(light: Photometry, where: str) -> Distribution:
+    """The mean over the planes of a photometric file.
+
+    Raises:
+        InputError: they differ.
+    """
+    values = light.values.mean(0)
+    off = float(abs(light.values - values).max()) / max(float(values.max()), 1e-300)
+    if off > SYMMETRIC:
+        raise InputError(
+            f"{where}: its planes C differ by {off:.0%} of the peak, and the intensity of a source depends on the angle to its axis"
+            " alone; a file that is symmetric about the axis is needed"
+        )
+    try:
+        return Distribution(tuple(light.angles.tolist()), tuple(values.clip(0.0).tolist()))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _table(data: bytes, where: str) -> Distribution:
+    """Parse text: a header line is optional; columns are separated by commas, semicolons or blanks; # begins a
     comment.
 
     Raises:

@@ -27,6 +27,11 @@ MOST_BYTES, MOST_ANGLES = 1 << 24, 2000
 LINE = 120
 #: LM-63-2019's code of a file made by a computer simulation.
 SIMULATED = "1.00010"
+#: Symmetries of EULUMDAT, Isym, by the first and the last plane of a file of LM-63 that has it: about the axis, about the plane
+#: 0 - 180, about 90 - 270, and about both.
+FOLDS = {1: (0.0, 0.0), 2: (0.0, 180.0), 3: (90.0, 270.0), 4: (0.0, 90.0)}
+#: Suffixes of the files.
+SUFFIXES = (".ies", ".ldt")
 ACCEPTED = "a photometric file of type C, IES LM-63 or EULUMDAT, is needed"
 
 
@@ -44,6 +49,18 @@ class Photometry(NamedTuple):
     name: str = "lamp"
     diameter: float = 0.0
     height: float = 0.0
+
+    def intensity(self, directions: np.ndarray) -> np.ndarray:
+        """Intensities, cd, in unit directions (N, 3), gamma being counted from +z and C from +x towards +y: linear in both angles,
+        0 beyond those of the file."""
+        from scipy.interpolate import RegularGridInterpolator  # noqa: PLC0415 - before torch is loaded it would delay refusals
+
+        x, y, z = directions.T
+        gamma, plane = np.degrees(np.arctan2(np.hypot(x, y), z)), np.degrees(np.arctan2(y, x)) % 360.0
+        around = np.concatenate([self.planes - 360.0, self.planes, self.planes + 360.0])
+        values = np.concatenate([self.values] * 3)
+        found = RegularGridInterpolator((around, self.angles), values, bounds_error=False, fill_value=0.0)
+        return found(np.stack([plane, gamma], 1))
 
 
 def write_ies(path: Path, light: Photometry) -> None:
@@ -117,17 +134,26 @@ def write_ldt(path: Path, light: Photometry) -> None:
 
 
 def read_photometry(path: Path) -> Photometry:
-    """Read a file of either format, by its first line.
+    """Read a file of either format, by its first line; planes that it leaves out by symmetry are added.
 
     Raises:
         InputError: it is damaged, too large or of another type.
     """
-    text = read_bytes(path, MOST_BYTES, ACCEPTED).decode("latin-1")
+    return parse_photometry(read_bytes(path, MOST_BYTES, ACCEPTED), f"{path}")
+
+
+def parse_photometry(data: bytes, where: str) -> Photometry:
+    """Read the contents of a file.
+
+    Raises:
+        InputError: as `read_photometry`, naming `where`.
+    """
+    text = data.decode("latin-1")
     try:
         return _ies(text) if text.startswith("IES") else _ldt(text.splitlines())
     except (ValueError, IndexError) as error:
         why = f"{error}" if isinstance(error, InputError) else "a number is missing or damaged"
-        raise InputError(f"{path}: {why}; {ACCEPTED}") from error
+        raise InputError(f"{where}: {why}; {ACCEPTED}") from error
 
 
 def _ies(text: str) -> Photometry:
@@ -139,36 +165,79 @@ def _ies(text: str) -> Photometry:
     _, lumens, factor, angles, planes, kind, unit, width, _, height = numbers[:10]
     if kind != 1:
         raise InputError("is not of type C")
-    if min(angles, planes) < 1 or max(angles, planes) > MOST_ANGLES:
-        raise InputError(f"has {angles:g} angles in {planes:g} planes, and at most {MOST_ANGLES} are read")
-    n, m = int(angles), int(planes)
+    n, m = _counted(angles, planes)
     body = np.array(numbers[13:])
     if len(body) < n + m + n * m:
         raise InputError("ends early")
     gamma, plane, values = body[:n], body[n : n + m], factor * numbers[10] * body[n + m : n + m + n * m].reshape(m, n)
-    if m > 1 and plane[-1] == 360.0:
-        plane, values = plane[:-1], values[:-1]
     scale = 1000.0 if unit == 2 else 304.8
     name = named.group(1) if named else "lamp"
-    return _checked(Photometry(plane, gamma, values, lumens, name, abs(width) * scale, height * scale))
+    light = _checked(Photometry(plane, gamma, values, lumens, name, abs(width) * scale, height * scale))
+    ends = (float(plane[0]), float(plane[-1]))
+    fold = next((k for k, limits in FOLDS.items() if ends == limits), 0)
+    light = _unfolded(light, fold, _mirrored(plane, fold)) if fold else light
+    if light.planes[-1] == 360.0:
+        light = light._replace(planes=light.planes[:-1], values=light.values[:-1])
+    return light if lumens > 0 else light._replace(lumens=_flux(light))  # absolute photometry
 
 
 def _ldt(lines: Sequence[str]) -> Photometry:
     words = [line.strip().replace(",", ".") for line in lines]
-    symmetry, planes, angles = int(words[2]), int(words[3]), int(words[5])
-    if symmetry != 0:
-        raise InputError(f"has the symmetry {symmetry}, and files without symmetry (0) are read")
-    if min(planes, angles) < 1 or max(planes, angles) > MOST_ANGLES:
-        raise InputError(f"has {angles} angles in {planes} planes, and at most {MOST_ANGLES} are read")
+    symmetry = int(words[2])
+    m, n = _counted(float(words[3]), float(words[5]))
+    if symmetry not in (0, *FOLDS):
+        raise InputError(f"has the symmetry {symmetry}, which is none of the format")
     sets = int(words[25])
     at = 26 + 6 * sets + 10
     lumens = float(words[28])
-    numbers = np.array([float(word) for word in words[at : at + planes + angles + planes * angles]])
-    if len(numbers) < planes + angles + planes * angles:
+    stored = {0: m, 1: 1, 2: m // 2 + 1, 3: m // 2 + 1, 4: m // 4 + 1}[symmetry]
+    numbers = np.array([float(word) for word in words[at : at + m + n + stored * n]])
+    if len(numbers) < m + n + stored * n:
         raise InputError("ends early")
-    values = lumens / 1000.0 * numbers[planes + angles :].reshape(planes, angles)
+    planes, values = numbers[:m], lumens / 1000.0 * numbers[m + n :].reshape(stored, n)
+    held = planes[:stored]
+    if symmetry == 3:  # from C 270 over 0 to 90: mirrored, from 90 to 270
+        held, values = planes[m // 4 : m // 4 + stored], values[::-1]
     size = float(words[12]), float(words[14])
-    return _checked(Photometry(numbers[:planes], numbers[planes : planes + angles], values, lumens, words[8], *size))
+    light = _checked(Photometry(held, numbers[m : m + n], values, lumens, words[8], *size))
+    return _unfolded(light, symmetry, planes) if symmetry else light
+
+
+def _counted(one: float, other: float) -> tuple[int, int]:
+    """Numbers of planes and of angles.
+
+    Raises:
+        InputError: there are none, or too many.
+    """
+    if not (min(one, other) >= 1 and max(one, other) <= MOST_ANGLES):
+        raise InputError(f"has {one:g} and {other:g} planes and angles, and at most {MOST_ANGLES} are read")
+    return int(one), int(other)
+
+
+def _folded(plane: np.ndarray, symmetry: int) -> np.ndarray:
+    """The planes among those that a file of this symmetry stores that are equal to these."""
+    plane = plane % 360.0
+    if symmetry == 1:
+        return 0.0 * plane
+    if symmetry == 3:
+        return np.where((plane >= 90.0) & (plane <= 270.0), plane, (180.0 - plane) % 360.0)
+    plane = np.minimum(plane, 360.0 - plane)
+    return plane if symmetry == 2 else np.minimum(plane, 180.0 - plane)
+
+
+def _mirrored(planes: np.ndarray, symmetry: int) -> np.ndarray:
+    """All planes of a file that stores these."""
+    if symmetry == 1:
+        return 90.0 * np.arange(4)
+    copies = {2: (planes, -planes), 3: (planes, 180.0 - planes), 4: (planes, -planes, 180.0 - planes, 180.0 + planes)}
+    return np.unique(np.concatenate(copies[symmetry]) % 360.0)
+
+
+def _unfolded(light: Photometry, symmetry: int, planes: np.ndarray) -> Photometry:
+    """The light in all planes."""
+    at = _folded(planes, symmetry)
+    rows = [np.interp(at, light.planes, column) for column in light.values.T]
+    return light._replace(planes=planes, values=np.stack(rows, 1))
 
 
 def _checked(light: Photometry) -> Photometry:

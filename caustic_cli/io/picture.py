@@ -51,8 +51,16 @@ def _disc() -> np.ndarray:
     return (x[:, None] ** 2 + x[None, :] ** 2 <= 0.25).astype(np.float64)
 
 
-#: Pictures by name, where there is no such file: a uniform rectangle and a disc; pixels across the latter.
-NAMED, DISC = {"uniform": lambda: np.ones((2, 2)), "disc": _disc}, 500
+def _headlamp() -> np.ndarray:
+    """Intensity of a passing beam: brightest below a horizontal cut-off, 0 above it."""
+    x = (2.0 * np.arange(DISC) + 1.0) / DISC - 1.0
+    falling = np.where(x < CUT_OFF, np.exp(1.5 * (x - CUT_OFF)), 0.0)
+    return np.exp(-1.5 * x * x)[:, None] * falling[None, :]
+
+
+#: Pictures by name, where there is no such file: a uniform rectangle, a disc and a passing beam; pixels across the latter two, and
+#: height of the cut-off, 1 being the upper edge.
+NAMED, DISC, CUT_OFF = {"uniform": lambda: np.ones((2, 2)), "disc": _disc, "headlamp": _headlamp}, 500, 0.8
 
 
 @dataclass(frozen=True, eq=False)

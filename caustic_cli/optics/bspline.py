@@ -104,6 +104,12 @@ class SplineSpace:
         return len(self.knots) - self.degree - 1
 
     @cached_property
+    def derivative(self) -> SplineSpace:
+        """The space of the derivatives, of degree p - 1, for the control points of `differences`; p > 1, and knots inside at most
+        p - 1 times."""
+        return SplineSpace(self.degree - 1, self.knots[1:-1])
+
+    @cached_property
     def breaks(self) -> Tensor:
         """The distinct knots, ascending: the breakpoints of the polynomial pieces."""
         return torch.unique(self.knots)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ from caustic_cli.optics.surfaces.polarfield import (
     PolarField,
     PolarHit,
     Vectors,
+    direction_of,
     frame,
     from_frame,
     polar_hit,
@@ -36,6 +38,8 @@ from caustic_cli.optics.surfaces.polarfield import (
 )
 from caustic_cli.optics.tolerances import LEAST_COSINE
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
+from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.rayset import RaySet
 
 #: Causes for which light is lost, in the order of their occurrence.
 LOSSES = ("inner_fresnel", "missed", "total_internal_reflection", "outer_fresnel")
@@ -45,6 +49,11 @@ SHALLOW = 0.02
 PROBES = 3
 #: Rays traced at a time.
 CHUNK = 1 << 17
+#: The constant a of a `PointGrid`, and its points over those of them within the circle.
+DENSER, CORNERS = 1.0, 1.1
+#: Steps of an additive sequence that covers the unit square evenly (Roberts 2018, from the plastic number).
+LATTICE = (0.7548776662466927, 0.5698402909980532)
+LAMBERTIAN = Chip()
 _DEGREE = 180.0 / math.pi
 
 
@@ -81,8 +90,18 @@ def concentric(s: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     return r * torch.cos(angle), r * torch.sin(angle)
 
 
+def on_chip(chip: Chip, s: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Points of a chip with an extent, mm, of equal area for equal area of the unit square."""
+    x, y = (2.0 * s - 1.0, 2.0 * t - 1.0) if chip.shape == "rectangle" else concentric(s, t)
+    return 0.5 * chip.size[0] * x, 0.5 * chip.size[1] * y
+
+
 def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
-    """About `count` rays of equal power, CHUNK at a time: stratified ones of a point, a Sobol sequence of a wider chip."""
+    """About `count` rays of equal power, CHUNK at a time: stratified ones of a point, a Sobol sequence of a wider chip, and of a
+    ray file its own, drawn at random by their flux, with replacement."""
+    if chip.rays is not None:
+        yield from _drawn(chip.rays, count, seed)
+        return
     point, side = chip.shape == "point", max(1, round(math.sqrt(count)))
     total = side * side if point else min(count, SOBOL_RAYS)
     for start in range(0, total, CHUNK):
@@ -92,11 +111,56 @@ def emissions(chip: Chip, count: int, seed: int) -> Iterator[ChipRays]:
             x = y = torch.zeros_like(s)
         else:
             s, t, k, m = numbers("sobol", (1, 1), seed, 4, start, stop)
-            x, y = (2.0 * k - 1.0, 2.0 * m - 1.0) if chip.shape == "rectangle" else concentric(k, m)
-            x, y = 0.5 * chip.size[0] * x, 0.5 * chip.size[1] * y
+            x, y = on_chip(chip, k, m)
         dx, dy = concentric(s, t)
+        if chip.intensity is not None:
+            dx, dy = _tabulated(chip.intensity, dx, dy)
         dz = (1.0 - dx * dx - dy * dy).clamp_min(0.0).sqrt()
         yield ChipRays((x, y, torch.zeros_like(x)), (dx, dy, dz), torch.full_like(dx, 1.0 / total))
+
+
+def _drawn(rays: RaySet, count: int, seed: int) -> Iterator[ChipRays]:
+    """Rays of a ray file."""
+    rng, sums = np.random.default_rng(seed), np.cumsum(rays.flux)
+    for start in range(0, count, CHUNK):
+        at = np.searchsorted(sums, sums[-1] * rng.uniform(size=min(CHUNK, count - start)), side="right")
+        (x, y, z), (dx, dy, dz) = (torch.from_numpy(c[at]).unbind(1) for c in (rays.positions, rays.directions))
+        yield ChipRays((x, y, z), (dx, dy, dz), torch.full_like(x, 1.0 / count))
+
+
+def _tabulated(intensity: Distribution, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Components of directions, of equal flux for equal area of the unit disc."""
+    fraction = x * x + y * y
+    sine = torch.from_numpy(np.sin(intensity.angle_of(fraction.numpy(), 0.5 * math.pi)))
+    scale = sine / fraction.sqrt().clamp_min(1e-300)
+    return scale * x, scale * y
+
+
+def chip_grids(chip: Chip, points: int, count: int) -> Iterator[ChipRays]:
+    """About `count` rays from points x points places of a chip, CHUNK at a time, of unequal power: in a grid of directions
+    (u, v), displaced from place to place by a part of its cells.
+
+    The places have the mean square distances of the chip's points.  Their images are as smooth as those of a `PointGrid`, which a
+    design needs more than independence of the rays; those of a ray file are its own.
+    """
+    if chip.rays is not None:
+        return emissions(chip, count, 0)
+    middle = (torch.arange(points, dtype=torch.float64) + 0.5) / points
+    s, t = (c.reshape(-1) for c in torch.meshgrid(middle, middle, indexing="ij"))
+    square = 1.0 / 12.0 if chip.shape == "rectangle" else 1.0 / 16.0
+    x, y = (c * (square * d * d / (c * c).mean()).sqrt() for c, d in zip(on_chip(chip, s, t), chip.size, strict=True))
+    side = max(1, round(math.sqrt(count / len(x) * 4.0 / math.pi)))
+    each = max(1, CHUNK // (side * side))
+    cells, total = torch.arange(side, dtype=torch.float64), 0.0
+    parts = []
+    for places in torch.arange(len(x)).split(each):
+        u, v = ((cells + ((places[:, None] + 1) * step).frac()) * (2.0 / side) - 1.0 for step in LATTICE)
+        u, v = (c.reshape(-1) for c in torch.broadcast_tensors(u[:, :, None], v[:, None, :]))
+        lit = u * u + v * v < 1.0
+        at, u, v = places.repeat_interleave(side * side)[lit], u[lit], v[lit]
+        parts.append(ChipRays((x[at], y[at], torch.zeros_like(u)), direction_of(u, v), emitted(chip, u, v)))
+        total += float(parts[-1].power.sum())
+    return (part._replace(power=part.power / total) for part in parts)
 
 
 def lambertian(u: Tensor, v: Tensor) -> Tensor:
@@ -105,24 +169,39 @@ def lambertian(u: Tensor, v: Tensor) -> Tensor:
     return (1.0 - rho2) / (1.0 + rho2) ** 3
 
 
+def emitted(chip: Chip, u: Tensor, v: Tensor) -> Tensor:
+    """The same of the points of a chip."""
+    if chip.intensity is None:
+        return lambertian(u, v)
+    rho2 = u * u + v * v
+    return torch.from_numpy(chip.intensity.relative(2.0 * np.arctan(rho2.sqrt().numpy()))) / (1.0 + rho2) ** 2
+
+
 class PointGrid:
     """Rows of a tensor grid of directions (u, v) of the light of a point, without the corners that it does not reach.
+
+    The coordinates of equispaced s are u = tan(a s) / tan(a): denser about the axis, where most of the light is, so that rays are
+    of less unequal power.
 
     u, v: (N,) coordinates of the directions; power: (N,), of sum 1 over all rows.
     """
 
-    def __init__(self, field: PolarField, sample: Sample):
-        u, v = torch.meshgrid(2.0 * sample.u - 1.0, 2.0 * sample.v - 1.0, indexing="ij")
+    def __init__(self, field: PolarField, sample: Sample, chip: Chip):
+        s, t = (2.0 * c - 1.0 for c in (sample.u, sample.v))
+        u, v = (torch.tan(DENSER * c) / math.tan(DENSER) for c in (s, t))
+        sample = replace(sample, u=0.5 * (u + 1.0), v=0.5 * (v + 1.0))
+        stretch = torch.outer(*(1.0 / torch.cos(DENSER * c) ** 2 for c in (s, t))).reshape(-1)
+        u, v = torch.meshgrid(u, v, indexing="ij")
         self.lit = (u * u + v * v < 1.0).reshape(-1).nonzero()[:, 0]
         self.u, self.v = u.reshape(-1)[self.lit], v.reshape(-1)[self.lit]
-        self.power = lambertian(self.u, self.v)
+        self.power = emitted(chip, self.u, self.v) * stretch[self.lit]
         self._surface = field.net.prepare(sample, torch.float64)
 
     @classmethod
-    def of(cls, field: PolarField, count: int) -> list[PointGrid]:
-        """About `count` rays, CHUNK at a time: small tensors stay in the cache of the processor."""
-        sampler = Sampler.of_size("grid", max(1, round(count * 4.0 / math.pi)))
-        grids = [cls(field, sample) for sample in sampler.chunks(CHUNK)]
+    def of(cls, field: PolarField, count: int, chip: Chip = LAMBERTIAN) -> list[PointGrid]:
+        """About `count` rays of the centre of a chip, CHUNK at a time: small tensors stay in the cache of the processor."""
+        sampler = Sampler.of_size("grid", max(1, round(count * CORNERS)))
+        grids = [cls(field, sample, chip) for sample in sampler.chunks(CHUNK)]
         total = sum(float(grid.power.sum()) for grid in grids)
         for grid in grids:
             grid.power /= total
@@ -130,14 +209,21 @@ class PointGrid:
 
     def hits(self, values: Tensor) -> PolarHit:
         """`PolarField.from_origin` in these directions."""
-        g, gu, gv = (c.reshape(-1).index_select(0, self.lit) for c in self._surface(values))
-        return polar_hit(self.u, self.v, g, gu, gv)
+        r, ru, rv = (c.reshape(-1).index_select(0, self.lit) for c in self._surface(values))
+        return polar_hit(self.u, self.v, r, ru, rv)
 
 
 def sides(values: Tensor) -> tuple[Tensor | None, Tensor]:
     """Control values (n, m) of the inner surface, None for a hemisphere, and of the outer one, from those of a lamp: (n, m) of the
     outer surface, or (2, n, m) of both."""
     return (None, values) if values.ndim == 2 else (values[0], values[1])
+
+
+def surfaces_of(lamp: Lamp, field: PolarField, values: Tensor) -> tuple[tuple[PolarField, Tensor], tuple[PolarField, Tensor]]:
+    """The outer and the inner surface with their control values."""
+    inner, outer = sides(values.detach())
+    sphere = PolarField.uniform((4, 4))
+    return (field, outer), (sphere, sphere.sphere(lamp.inner)) if inner is None else (field, inner)
 
 
 def least_wall(lamp: Lamp, field: PolarField, values: Tensor) -> float:
@@ -152,7 +238,7 @@ def least_wall(lamp: Lamp, field: PolarField, values: Tensor) -> float:
 
 
 def through_point(lamp: Lamp, field: PolarField, rays: PointGrid, values: Tensor) -> LampLight:
-    """Light of a point at the origin through the lens; differentiable by the control values of log r, see `sides`."""
+    """Light of a point at the origin through the lens; differentiable by the control values of r, see `sides`."""
     inner, outer = sides(values)
     if inner is None:
         return _from_point(lamp, rays.hits(outer), rays.power)
@@ -174,7 +260,7 @@ def _from_point(lamp: Lamp, hit: PolarHit, power: Tensor) -> LampLight:
 
 
 def through(lamp: Lamp, field: PolarField, rays: ChipRays, values: Tensor) -> LampLight:
-    """Light of a chip through the lens; differentiable by the control values of log r, see `sides`."""
+    """Light of a chip through the lens; differentiable by the control values of r, see `sides`."""
     inner, outer = sides(values)
     if lamp.chip.shape == "point":
         at = stereographic(*rays.direction)
@@ -222,8 +308,7 @@ def _meets_again(field: PolarField, inner: Tensor, start: Vectors, end: Vectors)
         found = torch.zeros_like(start[0], dtype=torch.bool)
         for k in range(1, PROBES + 1):
             x, y, z = (a + k / (PROBES + 1) * (b - a) for a, b in zip(start, end, strict=True))
-            g = field.net.evaluate(inner, *stereographic(x, y, z))[0]
-            found |= 0.5 * (x * x + y * y + z * z).log() < g
+            found |= (x * x + y * y + z * z).sqrt() < field.net.evaluate(inner, *stereographic(x, y, z))[0]
         return found
 
 
@@ -256,7 +341,7 @@ def _leave(lamp: Lamp, hit: PolarHit, local: Vectors, power: Tensor, lost: dict[
 
 
 def land(goal: Goal, light: LampLight) -> tuple[Tensor, Tensor, Tensor]:
-    """Coordinates of the light on the target, mm or degrees, and whether it travels towards it.
+    """Coordinates of the light from the centre of the target, mm or degrees, and whether it travels towards it.
 
     Light towards z <= 0 never meets a plane: it has the coordinates of a shallow ray.
     """
@@ -265,4 +350,4 @@ def land(goal: Goal, light: LampLight) -> tuple[Tensor, Tensor, Tensor]:
         return torch.atan2(dx, dz) * _DEGREE, torch.asin(dy.clamp(-1.0 + 1e-12, 1.0 - 1e-12)) * _DEGREE, dz > 0
     ahead = dz > SHALLOW
     t = (goal.distance - z) / torch.where(ahead, dz, torch.full_like(dz, SHALLOW))
-    return x + t * dx, y + t * dy, ahead
+    return x + t * dx - goal.shift[0], y + t * dy - goal.shift[1], ahead

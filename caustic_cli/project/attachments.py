@@ -116,10 +116,15 @@ def _light(path: Path, _given: Given) -> _Read:
     """A ray file, or the picture of a disc's brightness as irradiance."""
     suffix = path.suffix.lower()
     if suffix in rayfiles.SUFFIXES:
-        data = read_bytes(path, rayfiles.MAX_BYTES, rayfiles.ACCEPTED)
-        return _Read(data, rayfiles.parse_rays(data, str(path)), suffix)
+        return _rays(path, _given)
     light = read_picture(path, linear=True).irradiance()
     return _Read(read_bytes(path, rayfiles.MAX_BYTES, rayfiles.ACCEPTED), light, suffix)
+
+
+def _rays(path: Path, _given: Given) -> _Read:
+    """A ray file."""
+    data = read_bytes(path, rayfiles.MAX_BYTES, rayfiles.ACCEPTED)
+    return _Read(data, rayfiles.parse_rays(data, str(path)), path.suffix.lower())
 
 
 def _intensity(path: Path, _given: Given) -> _Read:
@@ -169,6 +174,8 @@ READERS: dict[str, Callable[[Path, Given], _Read]] = {
     "source.profile": _profile,
     "source.file": _light,
     "source.intensity": _intensity,
+    "lamp.intensity": _intensity,
+    "lamp.file": _rays,
     "source.spectrum": _spectrum,
     "lens.index_file": _index,
     "screen.shape_file": _sags,
@@ -199,13 +206,14 @@ def named_in_project(full: Settings) -> Settings:
     source = named(full.source)
     if source.also:
         source = source.changed(also=[named(table, f"-{k}") for k, table in enumerate(source.also, 2)])
-    second = None if full.second is None else named(full.second)
-    return full.changed(source=source, lens=named(full.lens), screen=named(full.screen), second=second, design=named(full.design))
+    second, lamp = (None if section is None else named(section) for section in (full.second, full.lamp))
+    same = {"lens": named(full.lens), "screen": named(full.screen), "design": named(full.design)}
+    return full.changed(source=source, second=second, lamp=lamp, **same)
 
 
 def of(full: Settings) -> list[Attached]:
     """All files referenced by complete settings."""
-    sections = (full.source, *full.source.also, full.lens, full.screen, full.design, *filter(None, [full.second]))
+    sections = (full.source, *full.source.also, full.lens, full.screen, full.design, *filter(None, [full.second, full.lamp]))
     return [value for section in sections for row in ROWS if isinstance(value := _value(section, row), Attached)]
 
 

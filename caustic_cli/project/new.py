@@ -7,17 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from caustic_cli.config import presets, settings
+from caustic_cli.config.lamp import goal_of
 from caustic_cli.config.settings import Given, Settings
 from caustic_cli.config.wave_stages import without_waves
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.io.files import Piped
+from caustic_cli.io.photometry import SUFFIXES, read_photometry
 from caustic_cli.io.picture import Picture, read_picture
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.obstruction import clear_shift
 from caustic_cli.project import attachments, colours, uptodate
 from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.schema.table import Parameters, TargetSettings
+
+photometric_target = OnDemand("caustic_cli.project.photometric_target")
 
 
 def new_project(
@@ -45,7 +50,10 @@ def new_project(
         said["element"] = {"list": list(parameters.elements)}
     goal = TargetSettings.of(said.get("target", {}))
     picture = (
-        target if isinstance(target, Picture) else read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
+        target
+        if isinstance(target, Picture)
+        else _photometric(target, said, parameters)
+        or read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
     )
     if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
         del said["source"]["weights"]
@@ -55,7 +63,7 @@ def new_project(
         said["source"] = colours.filled(said.get("source", {}), picture)
     full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
     if full.lamp is not None:
-        full = _with_picture(full, picture)
+        full = attachments.named_in_project(_with_picture(full, picture))
         return Project(out, full, picture, uptodate.digest(full, picture)), said
     for key in ("index_range", "index_control", "index_layers"):
         if f"lens.{key}" in given and full.lens.gradient != "free":
@@ -71,6 +79,25 @@ def new_project(
     full = attachments.named_in_project(full)
     asked = uptodate.digest(full, picture)
     return Project(out, full, picture, asked, without_waves=without_waves(full, "stages" in said.get("design", {}))), said
+
+
+def _photometric(target: Path | Piped, said: Given, parameters: Parameters) -> Picture | None:
+    """The picture of a photometric file, None for another file; a lamp without a size of its picture gets the angles of its light.
+
+    Raises:
+        InputError: the file is damaged or has no light, or the design is none of a lamp.
+    """
+    if isinstance(target, Piped) or target.suffix.lower() not in SUFFIXES:
+        return None
+    if "lamp" not in said:
+        raise InputError(f"{target}: is a photometric file, whose light lamps throw: ⟨+lamp.radius⟩ is needed")
+    light, lamp = read_photometry(target), said["lamp"]
+    try:
+        if "angles" not in lamp and "picture_size" not in parameters and "size" not in said.get("target", {}):
+            said["lamp"] = {**lamp, "angles": photometric_target.angles_of(light)}
+        return Picture(photometric_target.picture_of(light, goal_of(complete(said, 1.0, parameters))), "linear")
+    except InputError as error:
+        raise InputError(f"{target}: {error}") from error
 
 
 def _with_picture(full: Settings, picture: Picture) -> Settings:

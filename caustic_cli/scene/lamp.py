@@ -13,30 +13,57 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.rayset import RaySet
 
-SHAPES = ("point", "disc", "rectangle")
+SHAPES = ("point", "disc", "rectangle", "rays")
+#: Width of the classes of angles in which the intensity of a ray file is counted, degrees.
+CLASS = 5.0
 #: Widest target in the far field, degrees, along x and y: a lamp emits into z > 0.
 WIDEST = 178.0
+#: Border of a target, a fraction of its smaller side, that is no part of its interior: least, and most where a chip blurs more.
+BORDERS = (0.025, 0.1)
 #: Largest ratio of its sides, and least distance of a plane target in radii of the lens.
 OBLONG, NEAREST = 100.0, 2.0
 
 
 @dataclass(frozen=True)
 class Chip:
-    """A Lambertian emitter.
+    """An emitter, Lambertian unless its intensity is tabulated.
 
     Raises:
         InputError: an unknown shape, or a size that does not belong to it.
     """
 
-    #: point, disc (an ellipse where width and height differ) or rectangle.
+    #: point, disc (an ellipse where width and height differ), rectangle, or rays of a ray file.
     shape: str = "point"
     #: Full width and height, mm; 0 for a point.
     size: tuple[float, float] = (0.0, 0.0)
+    #: Of every point of it by the angle from +z; None for Lambert's law.
+    intensity: Distribution | None = None
+    #: Of a ray file, in the frame of the lamp.
+    rays: RaySet | None = None
+
+    @classmethod
+    def of_rays(cls, rays: RaySet) -> Chip:
+        """The chip that a ray file was measured of: its size is that of the places where rays begin, its intensity that of all.
+
+        Raises:
+            InputError: there is no light within 90 degrees of +z.
+        """
+        width, height = (2.0 * float(c) for c in np.abs(rays.positions[:, :2]).max(0))
+        edges = np.arange(0.0, 90.0 + CLASS, CLASS)
+        angle = np.degrees(np.arccos(rays.directions[:, 2].clip(-1.0, 1.0)))
+        seen = np.histogram(angle, edges, weights=rays.flux)[0] / -np.diff(np.cos(np.radians(edges)))
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        values = np.concatenate([seen[:1], seen, seen[-1:]])
+        return cls("rays", (width, height), Distribution((0.0, *middle.tolist(), 90.0), tuple(values.tolist())), rays)
 
     def __post_init__(self):
-        if self.shape not in SHAPES:
-            raise InputError(f"the shape of a chip must be one of {', '.join(SHAPES)}, got {self.shape!r}")
+        if self.shape not in SHAPES or (self.shape == "rays") != (self.rays is not None):
+            raise InputError(f"the shape of a chip must be one of {', '.join(SHAPES[:3])}, got {self.shape!r}")
+        if self.rays is not None:
+            return
         if not all(math.isfinite(s) and s >= 0 for s in self.size):
             raise InputError(f"the size of a chip must be finite and not negative, got {self.size}")
         if (self.shape == "point") != (self.size == (0.0, 0.0)) or (min(self.size) == 0 < max(self.size)):
@@ -45,14 +72,21 @@ class Chip:
             )
 
     @property
+    def centre(self) -> Chip:
+        """A point that emits as the chip does."""
+        return Chip(intensity=self.intensity)
+
+    @property
     def reach(self) -> float:
         """Largest distance of its points from the origin, mm."""
+        if self.rays is not None:
+            return float(np.linalg.norm(self.rays.positions, axis=1).max())
         return 0.5 * (math.hypot(*self.size) if self.shape == "rectangle" else max(self.size))
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Where the light is wanted: a rectangle centred on the axis, of a plane z = distance, or of angles in the far field.
+    """Where the light is wanted: a rectangle of a plane z = distance, or of angles in the far field, centred on the axis there.
 
     Angles are those of type A photometry: along x the longitude about the y axis, atan2(x, z), along y the latitude, asin y.
 
@@ -64,6 +98,8 @@ class Goal:
     size: tuple[float, float]
     #: Of the plane, mm; inf for the far field.
     distance: float = math.inf
+    #: Of its centre on the plane, from the axis, mm; 0 in the far field.
+    shift: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):
         if not all(0 < s < math.inf for s in self.size):
@@ -74,6 +110,10 @@ class Goal:
             )
         if not self.distance > 0:
             raise InputError(f"the distance of a target must be greater than 0 mm, or inf, got {self.distance}")
+        if not all(math.isfinite(s) for s in self.shift):
+            raise InputError(f"the shift of a target must be finite, got {self.shift}")
+        if self.far and self.shift != (0.0, 0.0):
+            raise InputError(f"a target in the far field is centred on the axis, got a shift of {self.shift}")
         if self.far and max(self.size) > WIDEST:
             raise InputError(f"a target in the far field is at most {WIDEST:g} degrees wide and high, got {self.size}")
 
@@ -88,6 +128,14 @@ class Goal:
         if self.far:
             along = np.diff(np.sin(np.radians(self.size[1] * (np.arange(pixels[1] + 1) / pixels[1] - 0.5))))
         return np.outer(across / across.sum(), along / along.sum())
+
+    @property
+    def nearest_edge(self) -> float:
+        """Angle from the axis of the middle of the nearest edge, degrees; negative if the axis misses the target."""
+        if self.far:
+            return min(self.size) / 2
+        reach = min(s / 2 - abs(c) for c, s in zip(self.shift, self.size, strict=True))
+        return math.degrees(math.atan(reach / self.distance))
 
     @property
     def unit(self) -> str:
@@ -113,12 +161,20 @@ class Lamp:
     wall: float = 1.0
     #: Number of free-form surfaces: with 2 the inner side is one instead of the hemisphere, and `inner` its least radius.
     surfaces: int = 1
+    #: Thickness of the foot below the plane of the chip, and width of its flange beyond the rim of the lens, mm.
+    base: float = 0.0
+    flange: float = 0.0
 
     def __post_init__(self):
         if self.surfaces not in (1, 2):
             raise InputError(f"a lamp has 1 or 2 free-form surfaces, got {self.surfaces!r}")
         if not 1.0 < self.index <= 5.0:
             raise InputError(f"⟨lens.index⟩ of a lamp must be greater than 1 and at most 5, got {self.index!r}")
+        if not all(0 <= s < math.inf for s in (self.base, self.flange)) or (self.flange > 0 and self.base == 0):
+            raise InputError(
+                "⟨lamp.base⟩ and ⟨lamp.flange⟩ must not be negative, and a flange needs the thickness ⟨+lamp.base⟩, got"
+                f" {self.base:g} and {self.flange:g} mm"
+            )
         if not self.chip.reach < self.inner < math.inf:
             raise InputError(
                 f"⟨lamp.inner⟩ must be greater than the radius of the chip, {self.chip.reach:g} mm, got {self.inner:g} mm"
@@ -128,6 +184,17 @@ class Lamp:
                 f"⟨lamp.radius⟩ must be greater than ⟨+lamp.inner⟩ and ⟨+lamp.wall⟩ together, {self.inner + self.wall:g} mm, got"
                 f" {self.radius:g} mm"
             )
+
+    def blur(self, goal: Goal) -> float:
+        """Full width of a point of the picture, mm or degrees: the chip as seen from the greatest radius of the lens, on the
+        axis.  It is wider off the axis, and where the surface is nearer to the chip."""
+        angle = max(self.chip.size) / self.radius
+        return math.degrees(angle) if goal.far else angle * goal.distance
+
+    def border(self, goal: Goal) -> float:
+        """Border of a target that its interior is without, mm or degrees: both sides of the blur, within BORDERS."""
+        least, most = (part * min(goal.size) for part in BORDERS)
+        return min(max(least, 2.0 * self.blur(goal)), most)
 
     @property
     def uncoated_limit(self) -> float:

@@ -240,8 +240,9 @@ class SourceSettings(Section):
             option=Option("--source-tilt", "A,B", BOTH))
     direction: Point | None = setting("that direction as a vector [x, y, z] of any length, z > 0, instead of tilt, as which a"
             " project keeps it")
-    intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of"
-            " degrees from +z and relative intensity", default="uniform", why="an isotropic source, the simplest",
+    intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, a .csv of"
+            " degrees from +z and relative intensity, or a photometric file (.ies, .ldt) symmetric about its axis",
+            default="uniform", why="an isotropic source, the simplest",
             option=Option("--intensity", "uniform|lambertian|FILE", BOTH), file="intensity")
     aim: bool = setting("sample rays over the lens instead of the whole cone", default=True, why="no rays that miss the lens")
     polarisation: float | None = setting("direction of linear polarisation from +x", "degrees", -360.0, 360.0,
@@ -288,10 +289,19 @@ class LampSettings(Section):
             option=Option("--lamp-surfaces", "1|2"))
     wall: float = setting("least distance between hemisphere and free-form surface", "mm", *LENS, default=1.0, why="injection"
             " moulding of acrylic", option=Option("--lamp-wall", "MM"))
+    base: float = setting("thickness of the foot of the lens, below the plane of the chip", "mm", 0.0, 1e6, default=0.0,
+            why="a base in that plane", written=False, option=Option("--lamp-base", "MM"))
+    flange: float = setting("width of a flange around the foot for holding, beyond the rim of the lens", "mm", 0.0, 1e6,
+            default=0.0, why="none", written=False, option=Option("--lamp-flange", "MM"))
     chip: Pair = setting("full width and height of the chip, 0 for a point", "mm", 0.0, 1e6, default=[0.0, 0.0], why="the limit"
             " that a small chip approaches", option=Option("--chip", "W[xH]"))
     shape: str = setting("shape of the chip: rectangle or disc", choices=("rectangle", "disc"), default="rectangle", written=False,
             option=Option("--chip-shape", "rectangle|disc"))
+    intensity: str | None = setting("angular distribution of the chip instead of Lambert's law: a .csv of degrees from +z and"
+            " relative intensity, or a photometric file (.ies, .ldt) symmetric about its axis", derived="Lambert's law",
+            option=Option("--chip-intensity", "FILE"), file="chip")
+    file: str | None = setting("ray file (TM-25 and others, as of a source) of the chip instead, in the frame of the lamp",
+            derived="a chip by its size", option=Option("--chip-rays", "FILE"), file="chip-rays")
     angles: Pair | None = setting("full width and height of the picture in the far field, its values being intensities: longitude"
             " about the vertical and latitude (type A photometry)", "degrees", 0.0, 178.0, above=True, derived="a picture on a"
             " screen", option=Option("--angles", "W[xH]"))

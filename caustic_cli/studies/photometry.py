@@ -13,13 +13,14 @@ and near them values are means over several planes.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
+from caustic_cli.optics.lamp import LampLight
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Lamp
 from caustic_cli.studies.lamp import RAYS, traced
@@ -50,6 +51,14 @@ class IntensityTable(NamedTuple):
         return float((self.values * self.solid_angles).sum())
 
     @property
+    def figures(self) -> dict[str, Any]:
+        """peak_candela, and beam_angles and field_angles in the planes C 0 - 180 and C 90 - 270, degrees: full angles of half and
+        of a tenth of the peak in each."""
+        planes = (0, len(self.planes) // 4)
+        angles = {name: [self.full_angle(part, k) for k in planes] for name, part in (("beam", 0.5), ("field", 0.1))}
+        return {"peak_candela": self.peak, **{f"{name}_angles": found for name, found in angles.items()}}
+
+    @property
     def peak(self) -> float:
         """Largest intensity."""
         return float(self.values.max())
@@ -72,25 +81,41 @@ class IntensityTable(NamedTuple):
         return float(self.angles[k] + part * self.angles[1])
 
 
-def intensity_table(
-    lamp: Lamp, field: PolarField, values: Tensor, steps: tuple[float, float] = STEPS, rays: int = RAYS, seed: int = 0
-) -> IntensityTable:
-    """The table of a lamp; steps: of gamma and C, degrees, which divide 180 and 360."""
-    angles = np.linspace(0.0, 180.0, round(180.0 / steps[0]) + 1)
-    planes = np.arange(round(360.0 / steps[1])) * steps[1]
-    power = torch.zeros(len(planes) * len(angles), dtype=torch.float64)
-    for _, light in traced(lamp, field, values, rays, seed):
+class IntensitySum:
+    """Sums light into the cells of a table; steps: of gamma and C, degrees, which divide 180 and 360."""
+
+    def __init__(self, steps: tuple[float, float] = STEPS):
+        self.steps = steps
+        self.angles = np.linspace(0.0, 180.0, round(180.0 / steps[0]) + 1)
+        self.planes = np.arange(round(360.0 / steps[1])) * steps[1]
+        self.power = torch.zeros(len(self.planes) * len(self.angles), dtype=torch.float64)
+
+    def add(self, light: LampLight) -> None:
+        """Add the light of half of the rays, of `studies.lamp.traced`."""
         x, y, z = light.direction
         gamma = torch.rad2deg(torch.atan2((x * x + y * y).sqrt(), z))
         plane = torch.rad2deg(torch.atan2(y, x))
-        k = (gamma / steps[0]).round().long()
-        j = (plane / steps[1]).round().long() % len(planes)
-        power.scatter_add_(0, j * len(angles) + k, light.power)
-    found = 0.5 * FLUX * power.view(len(planes), len(angles)).numpy()
-    found[:, [0, -1]] = found[:, [0, -1]].mean(0)  # the caps
-    for k in range(1, len(angles) - 1):  # near the poles cells are narrow: an arc of ARC steps of gamma at least is averaged
-        reach = round(0.5 * ARC * steps[0] / steps[1] / math.sin(math.radians(angles[k])))
-        if reach:
-            found[:, k] = uniform_filter1d(found[:, k], min(2 * reach + 1, len(planes)), mode="wrap")
-    table = IntensityTable(planes, angles, found)
-    return table._replace(values=found / table.solid_angles)
+        k = (gamma / self.steps[0]).round().long()
+        j = (plane / self.steps[1]).round().long() % len(self.planes)
+        self.power.scatter_add_(0, j * len(self.angles) + k, light.power)
+
+    def table(self) -> IntensityTable:
+        """The intensities of the light of both halves."""
+        found = 0.5 * FLUX * self.power.view(len(self.planes), len(self.angles)).numpy()
+        found[:, [0, -1]] = found[:, [0, -1]].mean(0)  # the caps
+        for k in range(1, len(self.angles) - 1):  # near the poles cells are narrow: arcs of ARC steps of gamma are averaged
+            reach = round(0.5 * ARC * self.steps[0] / self.steps[1] / math.sin(math.radians(self.angles[k])))
+            if reach:
+                found[:, k] = uniform_filter1d(found[:, k], min(2 * reach + 1, len(self.planes)), mode="wrap")
+        table = IntensityTable(self.planes, self.angles, found)
+        return table._replace(values=found / table.solid_angles)
+
+
+def intensity_table(
+    lamp: Lamp, field: PolarField, values: Tensor, steps: tuple[float, float] = STEPS, rays: int = RAYS, seed: int = 0
+) -> IntensityTable:
+    """The table of a lamp; steps: as of `IntensitySum`."""
+    found = IntensitySum(steps)
+    for _, light in traced(lamp, field, values, rays, seed):
+        found.add(light)
+    return found.table()

@@ -20,10 +20,11 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -72,9 +73,13 @@ VERIFICATION = Capability(
 
 def unsupported(scene: Scene) -> str:
     """Why a scene cannot be verified, "" if it can: Mitsuba is not installed, or it does not trace such scenes."""
-    if find_spec("mitsuba") is None:
-        return "⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install mitsuba"
-    return VERIFICATION.why_not(scene)
+    return not_installed() or VERIFICATION.why_not(scene)
+
+
+def not_installed() -> str:
+    """What is said where Mitsuba is not installed, "" where it is."""
+    missing = find_spec("mitsuba") is None
+    return "⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install mitsuba" if missing else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +108,7 @@ def verify(paths: Sequence[Path], scene: Scene, field: HeightField, heights: Ten
     Raises:
         CausticError: no variant of Mitsuba works on this machine, or no light reaches the screen.
     """
-    variant = _choose_variant()
+    variant = choose_variant()
     import mitsuba as mi  # noqa: PLC0415
 
     mi.set_log_level(mi.LogLevel.Error)
@@ -128,7 +133,7 @@ def verify(paths: Sequence[Path], scene: Scene, field: HeightField, heights: Ten
     return compare(renders, image, squares, rays, shift, {"mitsuba": mi.__version__, "variant": variant})
 
 
-def _choose_variant() -> str:
+def choose_variant() -> str:
     """Set the first variant that works on this machine.
 
     Each is tried in a subprocess, since Dr.Jit aborts with an LLVM that is too old.  (The environment variable DRJIT_LIBLLVM_PATH
@@ -154,7 +159,6 @@ def _trace(mi, world, scene: Scene, rays: int, seed: list[int]) -> tuple[np.ndar
     """Power per pixel [i, j], as a fraction of the source's, and the sums of squares of the contributions of the rays."""
     rng = np.random.default_rng(seed)
     shapes = {shape.id(): shape for shape in world.shapes()}
-    follow = _follow if "scalar" not in mi.variant() else _follow_scalar
     image, squares = np.zeros((2, *scene.screen.resolution))
     system = System.of(scene)
     receiver, own = Receiver.of(system, scene.screen), {EXIT: "mirror"} if scene.lens.mirror else {}  # the export's name of it
@@ -167,8 +171,18 @@ def _trace(mi, world, scene: Scene, rays: int, seed: list[int]) -> tuple[np.ndar
     return image / rays, squares / rays**2
 
 
+def follow(mi, world, shapes, surfaces: list[tuple[str, bool]], start: np.ndarray, direction: np.ndarray):
+    """Landing points x, y, z (mm) and weights of all rays through this sequence of surfaces; weight 0 where lost.
+
+    Args:
+        shapes: of the scene, by name; surfaces: names, and whether each reflects, the screen last.
+        start: (3, N) mm; direction: (3, N) unit vectors.
+    """
+    return (_follow if "scalar" not in mi.variant() else _follow_scalar)(mi, world, shapes, surfaces, start, direction)
+
+
 def _follow(mi, world, shapes, surfaces: list[tuple[str, bool]], start: np.ndarray, direction: np.ndarray):
-    """Landing points x, y, z (mm) and weights of all rays through this sequence of surfaces; weight 0 where lost."""
+    """The same, all rays at a time."""
     ray = mi.Ray3f(mi.Point3f(*map(mi.Float, start)), mi.Vector3f(*map(mi.Float, direction)))
     weight, active = mi.Float(1.0), mi.Bool(True)
     for name, reflects in surfaces:
@@ -323,12 +337,12 @@ def _noise(image: np.ndarray, squares: np.ndarray, renders: np.ndarray) -> float
     return float(np.sqrt(squares.mean() + renders.var(0, ddof=1).mean() / len(renders)) / image.mean())
 
 
-def write_panels(path: str | Path, found: Agreement, scene: Scene) -> None:
+def write_panels(path: str | Path, found: Agreement, half_size: tuple[float, float]) -> None:
     """Write a PNG with the render, Mitsuba's image, and their difference in standard deviations."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     figure = Figure(figsize=(14.4, 5.0), dpi=100, layout="constrained")
-    axes, (sx, sy) = figure.subplots(1, 3), scene.screen.half_size
+    axes, (sx, sy) = figure.subplots(1, 3), half_size
     white = np.quantile(found.render, 0.999) or 1.0
     shown = {"extent": [-sx, sx, -sy, sy], "origin": "lower"}
     for axis, image, title in zip(axes, (found.render, found.mitsuba), ("caustic", "Mitsuba 3"), strict=False):
@@ -345,3 +359,17 @@ def write_panels(path: str | Path, found: Agreement, scene: Scene) -> None:
     )
     with atomic_file(path) as file:
         figure.savefig(file, format="png", metadata={"Software": SOFTWARE})
+
+
+def rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The figures of a comparison, with its image, as rows for display."""
+    noise = f"{f['z_mean_square']:.3f}, {f['z_beyond_3']:.2%}, {f['z_largest']:.2f}  (of noise: 1, 0.27%, 4)"
+    return [
+        ("decision", "agree" if f["agree"] else "DISAGREE"),
+        ("mean Z^2, beyond 3, largest", noise),
+        ("judged", f"{f['pixels']:,} of {f['pixel_side']} x {f['pixel_side']} pixels, {f['noise']:.1%} noise each"),
+        ("relative RMS beyond noise", f"{f['relative_rms_beyond_noise']:.4f} of {f['relative_rms']:.4f}"),
+        ("light on the screen", f"{f['on_screen']:.6f}, render {f['on_screen_render']:.6f} ({f['light_z']:.1f} sigma)"),
+        ("correlation, and turned", f"{f['correlation']:.5f}, {f['correlation_turned']:.5f}"),
+        ("image", f["image"]),
+    ]

@@ -1,7 +1,7 @@
-"""Lamps: their design, render and export, as those of lenses in `design`, `render` and `export`.
+"""Lamps: their design and render, as those of lenses in `design` and `render`; their export is `lamp_export`.
 
-A lamp is a project like others, whose checkpoint holds the control values of log r instead of heights.  It is written when its
-design has ended; an interrupted one is begun anew.
+A lamp is a project like others, whose checkpoint holds the control values of r instead of heights.  It is written after every
+stage, with which an interrupted design goes on.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,39 +22,52 @@ from caustic_cli import __version__
 from caustic_cli.config.lamp import goal_of, lamp_of
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
-from caustic_cli.export.lamp import MESHES, write_lamp
+from caustic_cli.export.lamp_mitsuba import FINE, plane_of, write_lamp_mitsuba
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, stages_of, wanted
+from caustic_cli.inverse.lamp_limits import chip_limits
 from caustic_cli.io.files import Piped
-from caustic_cli.io.photometry import Photometry, write_ies, write_ldt
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.surfaces.polarfield import PolarField
-from caustic_cli.project import directory, uptodate
+from caustic_cli.project import checkpoint, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.new import new_project
-from caustic_cli.project.project import RENDER, Project
+from caustic_cli.project.project import CHECKPOINT, RENDER, REPORT, Project
 from caustic_cli.scene.lamp import Goal, Lamp
 from caustic_cli.studies.lamp import lamp_figures
-from caustic_cli.studies.photometry import FLUX, intensity_table
+from caustic_cli.studies.lamp_verify import verify_lamp
+from caustic_cli.studies.photometry import IntensitySum, IntensityTable
 from caustic_cli.studies.tolerances import one_thread
+from caustic_cli.studies.verify import write_panels
+from caustic_cli.workflow import lamp_formats
+from caustic_cli.workflow.lens import Render, count
 from caustic_cli.workflow.reporter import Reporter
 
-retrace = OnDemand("caustic_cli.studies.retrace")
+lamp_report = OnDemand("caustic_cli.studies.lamp_report")
 
-#: Photometric formats: suffix, writer and description.
-PHOTOMETRIC = {"ies": (".ies", write_ies, "IES LM-63-2019, type C"), "ldt": (".ldt", write_ldt, "EULUMDAT")}
-FORMATS = MESHES | PHOTOMETRIC
+#: Pixels of a comparison with Mitsuba, and its rays unless given.
+VERIFIED, BESIDE_RAYS = 2400, 1_000_000
 #: Part of the brightest pixels of an image that are white.
 WHITE = 0.999
+
+
+class Evaluation(NamedTuple):
+    """image, wanted: part of the light on each pixel, (n_x, n_y), and as it should be; table: of intensities; figures: of
+    `studies.lamp` and of the table."""
+
+    image: np.ndarray
+    wanted: np.ndarray
+    table: IntensityTable
+    figures: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class LampDesign:
     """A designed lamp.
 
-    project: where it is kept; values: control values of log r over the spline spaces `field`, (n, m) or (2, n, m)
+    project: where it is kept; values: control values of r, mm, over the spline spaces `field`, (n, m) or (2, n, m)
     (`optics.lamp.sides`); picture: irradiance (a, b), or intensity in the far field; figures: of the JSON table.
     """
 
@@ -83,23 +97,67 @@ class LampDesign:
             raise project.error(f"{error}") from error
         return cls(project, lamp, goal, field, values, picture_of(project), dict(saved.results))
 
-    def image_and_figures(self, rays: int | None, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
-        """Part of the light on each pixel, (n_x, n_y), and the figures of `studies.lamp`, with those of the far field; rays: None
-        for those of the evaluation of a design."""
+    @property
+    def name(self) -> str:
+        """Its name in files: that of its project."""
+        return "lamp" if self.project.path is None else self.project.path.resolve().stem
+
+    @property
+    def exported(self) -> lamp_formats.Exported:
+        """As it is written in a format."""
+        return lamp_formats.Exported(self.lamp, self.goal, self.field, self.values, self.name, self.project.seed)
+
+    def evaluated(self, rays: int | None, seed: int) -> Evaluation:
+        """The light by independent rays; rays: None for those of the evaluation of a design."""
         effort = current_effort()
         rays = rays or effort.final_rays
-        stages = effort.lamp_stages
-        fine, coarse = (
-            wanted(self.goal, self.picture, pixels_of(self.goal, count)).numpy() for count in (4 * stages[-1][0], stages[1][0])
-        )
+        finest = effort.lamp_pixels if self.lamp.chip.shape == "point" else effort.lamp_pixels // 4  # of what it does not blur
+        counts = finest, effort.lamp_pixels // 16
+        fine, coarse = (wanted(self.goal, self.picture, pixels_of(self.goal, count)).numpy() for count in counts)
         shaded = len(np.unique(self.picture[self.picture > 0])) > 1
-        found, figures = lamp_figures(
-            self.lamp, self.goal, self.field, self.values, fine, coarse, shaded=shaded, rays=rays, seed=seed
-        )
-        if self.goal.far:
-            table = intensity_table(self.lamp, self.field, self.values, rays=rays, seed=seed)
-            figures |= {"peak_candela": table.peak, "beam_angles": [table.full_angle(0.5, k) for k in (0, len(table.planes) // 4)]}
-        return found.image, figures
+        intensities = IntensitySum()
+        how: dict[str, Any] = {"shaded": shaded, "rays": rays, "seed": seed, "also": intensities.add}
+        found, figures = lamp_figures(self.lamp, self.goal, self.field, self.values, fine, coarse, **how)
+        table = intensities.table()
+        return Evaluation(found.image, fine, table, figures | table.figures)
+
+    def render(self, rays: float | None = None, *, seed: int | None = None) -> Render:
+        """Trace the lamp with independent rays: part of the light on each pixel, and the figures of `caustic render`.
+
+        rays: None for those of the evaluation of a design.
+        """
+        seen = self.evaluated(None if rays is None else count(rays), self.project.seed if seed is None else seed)
+        return Render(seen.image, seen.figures)
+
+    def export(self, path: str | Path, format: str | None = None, *, samples: tuple[int, int] | None = None) -> Path:
+        """Export the lamp or its light; the format follows from the suffix unless it is given; samples: rings, and points of each.
+
+        Raises:
+            InputError: the format is not one of a lamp, or has no samples.
+        """
+        name = format or lamp_formats.format_of(Path(path).suffix)
+        lamp_formats.check_export(name, samples)
+        lamp_formats.write(Path(path), self.exported, name, samples)
+        return Path(path)
+
+    def write_report(self, path: Path, found: Evaluation) -> None:
+        """Write the report of an evaluation."""
+        of = (self.lamp, self.goal, self.field, self.values)
+        lamp_report.write_lamp_report(path, *of, found.image, found.wanted, found.table, found.figures)
+
+    def verified(self, panels: Path, rays: int, seed: int) -> dict[str, Any]:
+        """The figures of a comparison with Mitsuba, and its image, which is written.
+
+        Raises:
+            CausticError: see `studies.lamp_verify`.
+        """
+        pixels, seen = pixels_of(self.goal, VERIFIED), plane_of(self.goal, self.lamp.radius)
+        with TemporaryDirectory() as folder:
+            scene = Path(folder) / "lamp.xml"
+            write_lamp_mitsuba(scene, self.lamp, self.goal, self.field, self.values, pixels, FINE, dark=True)
+            found = verify_lamp(scene, self.lamp, seen, self.field, self.values, pixels, rays, seed)
+        write_panels(panels, found, (0.5 * seen.size[0], 0.5 * seen.size[1]))
+        return found.figures | {"image": str(panels)}
 
 
 def picture_of(project: Project) -> np.ndarray:
@@ -124,42 +182,75 @@ def design(
     Raises:
         InputError: invalid input; nothing was written.
     """
-    began = Start.now()
     project, _ = new_project(target, given, preset, config, out, say.say)
     if out is not None and not force and (same := uptodate.same_design(out, project.asked)):
-        say.say(
-            f"{out}: was designed from the same picture with the same options, so there is nothing to do; ⟨force⟩ designs it anew"
-        )
-        return LampDesign.of(same[0])
+        say.say(f"{out}: was designed from the same picture with the same options")
+        return resume(same[0], say)
     if out is not None:
         directory.check(out, force)
-    s, effort = project.settings, current_effort()
+    return _run(project, None, force, say)
+
+
+def resume(project: Project, say: Reporter) -> LampDesign:
+    """Go on with the design of a project after its last complete stage; a finished one is opened.
+
+    Raises:
+        InputError: there is no lamp.
+    """
+    saved = project.load()
+    if saved.results:
+        say.say(f"{project.path}: is finished, so there is nothing to do; ⟨force⟩ designs it anew")
+        return LampDesign.of(project)
+    with project.hold:
+        assert project.path is not None
+        project.hold.enter_context(directory.locked(project.path))
+        return _run(project, saved, True, say)
+
+
+def _run(project: Project, before: Checkpoint | None, force: bool, say: Reporter) -> LampDesign:
+    """Design a lamp after the stages that were done `before`, and evaluate it; the checkpoint is written after each stage."""
+    began, s, effort = Start.now(), project.settings, current_effort()
     lamp, goal, picture = lamp_of(s), goal_of(s), picture_of(project)
-    for words in notes(lamp, goal):
+    for words in (*notes(lamp, goal), *chip_limits(lamp, goal, picture, effort.bound_steps)):
         say.say(words)
     stages = stages_of(lamp, effort)
     last, total = len(stages), sum(iterations for _, (_, _, iterations, _) in stages)
-    history = list[tuple[int, int, float, float, float]]()
-    with say.progress(total) as show:
+    state = State(torch.empty(0)) if before is None else before.state
+    history, earlier = list(state.history), state.seconds
+    made = {"caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "seed": s.design.seed}
 
-        def told(stage: int, _: int, loss: float) -> None:
-            history.append((len(history) + 1, stage, loss, 0.0, began.seconds))
-            show(f"stage {stage + 1}/{last}", f"loss {loss:.5f}", len(history), total)
+    def told(stage: int, _: int, loss: float) -> None:
+        history.append((len(history) + 1, stage, loss, 0.0, earlier + began.seconds))
+        show(f"stage {stage + 1}/{last}", f"loss {loss:.5f}", len(history), total)
 
-        with one_thread():  # the tensors of a chunk of rays are too small for more
-            values = design_lamp(lamp, goal, picture, effort=effort, seed=s.design.seed, on_iteration=told)
-    found = LampDesign(project, lamp, goal, field_of(effort), values, picture, {})
-    image, figures = found.image_and_figures(None, s.design.seed)
-    figures |= {"iterations": len(history), "seconds": began.seconds, "reason": "iterations"}
-    if out is not None:
-        figures |= {"image": str(out / RENDER), "project": str(out)}
-        state = State(
-            values, len(effort.lamp_stages) - 1, 0, len(history), history=history, seconds=began.seconds, reason="iterations"
-        )
-        made = {"caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "seed": s.design.seed}
-        with project.hold:
-            directory.create(project, force, Checkpoint(state, found.field.spaces, made, figures, uptodate.inputs(project)))
-            _write_image(out / RENDER, image, project, goal)
+    def save(done: int, field: PolarField, values: Tensor, figures: dict[str, Any] | None = None) -> None:
+        nonlocal before
+        if project.path is None:
+            return
+        why = {"reason": "iterations"} if figures else {}
+        state = State(values, done, 0, len(history), history=list(history), seconds=earlier + began.seconds, **why)
+        saved = Checkpoint(state, field.spaces, made, figures or {}, uptodate.inputs(project))
+        if before is None:
+            directory.create(project, force, saved)
+        else:
+            checkpoint.save(project.path / CHECKPOINT, saved)
+        before = saved
+
+    with project.hold:
+        with say.progress(total) as show, one_thread():  # the tensors of a chunk of rays are too small for more threads
+            begun = None if before is None else (before.state.stage, PolarField(before.spaces), before.state.heights)
+            how: dict[str, Any] = {"effort": effort, "begun": begun}
+            values = design_lamp(lamp, goal, picture, **how, on_iteration=told, on_stage=save)
+        found = LampDesign(project, lamp, goal, field_of(effort), values, picture, {})
+        evaluation = found.evaluated(None, s.design.seed)
+        seconds = earlier + began.seconds
+        figures = evaluation.figures | {"iterations": len(history), "seconds": seconds, "reason": "iterations"}
+        if project.path is not None:
+            figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
+            _write_image(project.path / RENDER, evaluation.image, project, goal)
+            if effort.report:
+                found.write_report(project.path / REPORT, evaluation)
+        save(last, found.field, values, figures)
     return replace(found, figures=figures)
 
 
@@ -169,11 +260,10 @@ def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
     if lamp.surfaces == 2:
         return
     most = math.degrees(math.acos(1.0 / lamp.index))
-    sides = [math.radians(s / 2) if goal.far else math.atan(s / 2 / goal.distance) for s in goal.size]
-    if (needed := 90.0 - math.degrees(min(sides))) > most:
+    if (needed := 90.0 - goal.nearest_edge) > most:
         yield (
             f"one surface of index {lamp.index:.4g} turns light by at most {most:.1f} degrees, and that of the rim would have to be"
-            f" turned by {needed:.0f} to reach the nearer edges of the picture: part of it falls beside"
+            f" turned by {needed:.0f} to reach the nearest edge of the picture: part of it falls beside"
         )
 
 
@@ -184,70 +274,68 @@ def _write_image(path: Path, image: np.ndarray, project: Project, goal: Goal, wi
 
 
 def render(
-    project: Project, rays: int | None, seed: int | None, image: Path | None, npy: Path | None, force: bool, say: Reporter
+    project: Project,
+    rays: int | None,
+    seed: int | None,
+    image: Path | None,
+    npy: Path | None,
+    force: bool,
+    say: Reporter,
+    mitsuba: bool = False,
+    report: bool = False,
 ) -> dict[str, Any]:
     """Trace a lamp with independent rays, write its image, and return its figures; arguments as of caustic render.
+
+    mitsuba: compare with Mitsuba as well, and write the panels beside the image; report: write the report there.
 
     Raises:
         InputError: there is no lamp, or a file exists already; nothing was written.
     """
     began, path = time.monotonic(), image or project.image
-    made = uptodate.Outputs(project, "render", {"rays": rays, "seed": seed}, [path, npy])
-    if not force and (figures := made.found()):
+    panels, plots = (
+        path.with_name(name if image is None else f"{path.stem}-{name}") if asked else None
+        for name, asked in (("verify.png", mitsuba), (REPORT, report))
+    )
+    made = uptodate.Outputs(project, "render", {"rays": rays, "seed": seed, "report": report}, [path, npy, panels, plots])
+    if not (force or mitsuba) and (figures := made.found()):
         say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
         return figures
     made.refuse_foreign(force)
     lamp = LampDesign.of(project)
-    seen, figures = lamp.image_and_figures(rays, project.seed if seed is None else seed)
-    _write_image(path, seen, project, lamp.goal, WIDE if image is None else 1)
+    seen = lamp.evaluated(rays, project.seed if seed is None else seed)
+    _write_image(path, seen.image, project, lamp.goal, WIDE if image is None else 1)
     if npy is not None:
-        write_npy(npy, seen)
-    figures |= {"iterations": lamp.figures.get("iterations"), "seconds": time.monotonic() - began, "image": str(path)}
+        write_npy(npy, seen.image)
+    if plots is not None:
+        lamp.write_report(plots, seen)
+    figures = seen.figures | {"iterations": lamp.figures.get("iterations"), "seconds": time.monotonic() - began, "image": str(path)}
+    if panels is not None:
+        figures["verify"] = lamp.verified(panels, rays or BESIDE_RAYS, project.seed if seed is None else seed)
+        return figures
     made.keep(figures)
     return figures
-
-
-def check_export(format: str, samples: tuple[int, int] | None) -> None:
-    """Refuse a format that no lamp has, or samples of one that has none.
-
-    Raises:
-        InputError: as it says.
-    """
-    if format not in FORMATS:
-        raise InputError(
-            f"⟨format⟩ {format} holds height fields, and a lamp's surface is none; {', '.join(FORMATS)} hold the lamp or its light"
-        )
-    if samples is not None and format in PHOTOMETRIC:
-        raise InputError(f"⟨samples⟩ belongs to {', '.join(MESHES)}, got {format}")
 
 
 def export(
     project: Project, format: str, output: Path | None, samples: tuple[int, int] | None, force: bool, say: Reporter
 ) -> dict[str, Any]:
-    """Write a lamp in one of FORMATS; returns file, format, bytes and seconds, and for a photometric file of its light flux, lm per
-    1000 lm of the chip, and peak_candela.
+    """Write a lamp in one of `lamp_formats.FORMATS`; returns file, format, bytes, seconds, and beside, the further files; of a
+    photometric file the flux of its light, lm per 1000 lm of the chip, and peak_candela.
 
     Raises:
         InputError: there is no lamp, the format is not one of a lamp, or a file exists already; nothing was written.
     """
     began = time.monotonic()
-    check_export(format, samples)
+    lamp_formats.check_export(format, samples)
     assert project.path is not None
-    path = output or Path(project.path.resolve().stem + FORMATS[format][0])
-    made = uptodate.Outputs(project, "export", {"format": format, "samples": samples}, [path])
+    own = lamp_formats.FORMATS[format]
+    path = output or Path(project.path.resolve().stem + own.suffix)
+    made = uptodate.Outputs(project, "export", {"format": format, "samples": samples}, [path, *own.companions(path)])
     if not force and (found := made.found()):
         say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
         return found
     made.refuse_foreign(force)
-    lamp, more = LampDesign.of(project), {}
-    if format in MESHES:
-        write_lamp(path, format, lamp.lamp, lamp.field, lamp.values, samples)
-    else:
-        table = intensity_table(lamp.lamp, lamp.field, lamp.values, rays=current_effort().final_rays, seed=project.seed)
-        greatest = lamp.field.extent(lamp.values if lamp.lamp.surfaces == 1 else lamp.values[1])[1]
-        name = project.path.resolve().stem
-        PHOTOMETRIC[format][1](path, Photometry(table.planes, table.angles, table.values, FLUX, name, 2.0 * greatest, greatest))
-        more = {"flux": table.flux, "peak_candela": table.peak}
+    more = lamp_formats.write(path, LampDesign.of(project).exported, format, samples)
     figures = {"file": str(path), "format": format, "bytes": path.stat().st_size, **more, "seconds": time.monotonic() - began}
     made.keep(figures)
     return figures
@@ -266,15 +354,19 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("on target", f"{figures['of_source']:.2%} of all light; uncoated limit {figures['uncoated_limit']:.2%}"),
         (
             "relative RMS error",
-            f"{number('interior_rms', '.4f')}, noise {number('interior_noise', '.2g')}; with the outer 2.5 %"
+            f"{number('interior_rms', '.4f')}, noise {number('interior_noise', '.2g')}; with the outer"
+            f" {number('border', '.4g')} {'degrees' if 'cut_off' in figures else 'mm'}"
             f" {number('relative_rms', '.4f')}, noise {number('noise', '.2g')}",
         ),
         ("least over mean", number("uniformity", ".3f")),
         ("lost", ", ".join(f"{name} {part:.2%}" for name, part in lost.items()) or "nothing"),
     ]
-    if "peak_candela" in figures:
-        angles = " x ".join(f"{angle:.0f}" for angle in figures["beam_angles"])
-        found.append(("peak", f"{figures['peak_candela']:.0f} cd per 1000 lm of the chip; half of it at {angles} degrees"))
+    beam, field = (" x ".join(f"{angle:.0f}" for angle in figures[f"{name}_angles"]) for name in ("beam", "field"))
+    found.append(
+        ("intensity", f"{figures['peak_candela']:.0f} cd per 1000 lm of the chip; beam angle {beam} degrees, field angle {field}")
+    )
+    if figures.get("cut_off") is not None:
+        found.append(("upper edge", f"{figures['cut_off']:.2f} degrees from 90 % to 10 % of the intensity beneath it"))
     found += [
         ("least wall", f"{figures['least_wall']:.3g} mm; greatest radius {figures['greatest_radius']:.4g} mm"),
         ("rays", f"{figures['rays']:,} on {width} x {height} pixels"),

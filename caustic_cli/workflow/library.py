@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config import keywords
+from caustic_cli.config.lamp import asks_for_lamp, says_lamp
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.io.files import Piped
@@ -37,7 +38,9 @@ from caustic_cli.optics.trace import tracers
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow.lens import Lens, Render, count, load
+from caustic_cli.workflow import lamp, lens
+from caustic_cli.workflow.lamp import LampDesign
+from caustic_cli.workflow.lens import Lens, Render, count
 from caustic_cli.workflow.movie import recorder
 from caustic_cli.workflow.reporter import Listener, Reporter
 
@@ -65,8 +68,8 @@ def design(
     on_message: Callable[[str], None] | None = None,
     device: str = "cpu",
     **given: Any,
-) -> Lens:
-    """Design a lens for a picture, as `caustic design` does.
+) -> Lens | LampDesign:
+    """Design a lens for a picture, as `caustic design` does; with `lamp` a lamp.
 
     Args:
         picture: a file, or irradiance (n_x, n_y), not negative, [i, j] with j upwards.
@@ -133,8 +136,8 @@ def design_of(
     error: float | None = None,
     say: Reporter,
     device: str = "cpu",
-) -> Lens:
-    """Design a lens for a picture and settings by their paths in `schema.table`: {"mag": 3, "lens.size": [20, 20]}.
+) -> Lens | LampDesign:
+    """Design a lens or a lamp for a picture and settings by their paths in `schema.table`: {"mag": 3, "lens.size": [20, 20]}.
 
     Args:
         preset: settings by name, see `config.presets`; config: a TOML file of further ones, which override those of the preset and
@@ -148,6 +151,9 @@ def design_of(
     began = Start.now()
     read = Path(target) if isinstance(target, str) else target
     how: dict[str, Any] = {"preset": preset, "config": config}
+    if asks_for_lamp(given, preset, config):
+        _refuse_for_lamps({"movie": movie, "error": error}, device)
+        return lamp.design(read, given, **how, out=out, force=force, say=say)
     qualities = [None] if error is None else estimate.cheapest(read, given, error, say, **how)
     for quality in qualities:
         wanted, recording = given if quality is None else {**given, "quality": quality}, recorder(movie, force)
@@ -168,8 +174,8 @@ def resume(
     force: bool = False,
     say: Reporter | None = None,
     device: str = "cpu",
-) -> Lens:
-    """Continue the design of a project directory from its last checkpoint.
+) -> Lens | LampDesign:
+    """Continue the design of a project directory from its last checkpoint, that of a lamp from its last complete stage.
 
     Args:
         iterations: in total, counted from the beginning, instead of those of the project; time_limit: s.
@@ -178,8 +184,33 @@ def resume(
     Raises:
         InputError: there is no project, or it was edited into another design.
     """
+    if says_lamp(Path(path)):
+        _refuse_for_lamps({"movie": movie, "design.iterations": iterations, "design.time_limit": time_limit}, device)
+        return lamp.resume(Project.open(path), say or Listener())
     began, say, recording = Start.now(), say or Listener(), recorder(movie, force)
     return _lens(workflow.resume(Project.open(path), iterations, time_limit, device, say, began, recording), device)
+
+
+def _refuse_for_lamps(given: Mapping[str, Any], device: str) -> None:
+    """Refuse arguments that the design of a lamp does not take.
+
+    Raises:
+        InputError: one is given.
+    """
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"⟨{name}⟩ is for a lens before its light, not for a lamp around it")
+    if device != "cpu":
+        raise InputError(f"a lamp is designed on the CPU: leave out ⟨device⟩ {device}")
+
+
+def load(path: str | Path, at: str | None = None, **given: Any) -> Lens | LampDesign:
+    """The lamp of a project directory, or the lens as of `workflow.lens.load`."""
+    if says_lamp(Path(path)):
+        if at is not None or given:
+            raise InputError(f"{path}: is a lamp, which has no other light or screen, got {', '.join([*given] or ['at'])}")
+        return LampDesign.of(Project.open(path))
+    return lens.load(path, at, **given)
 
 
 def _lens(done: workflow.Result, device: str) -> Lens:
@@ -187,9 +218,9 @@ def _lens(done: workflow.Result, device: str) -> Lens:
     return Lens(done.scene, done.field, done.heights, done.target, done.figures, done.project, done.state, made)
 
 
-def render(lens: Lens | str | Path, rays: float | None = None, **options: Any) -> Render:
-    """`Lens.render` of a lens, or of a project or an archive, with the keywords of `load`, too."""
-    if isinstance(lens, Lens):
+def render(lens: Lens | LampDesign | str | Path, rays: float | None = None, **options: Any) -> Render:
+    """`Lens.render` of a lens or a lamp, or of a project or an archive, with the keywords of `load`, too."""
+    if isinstance(lens, Lens | LampDesign):
         return lens.render(rays, **options)
     own = {name: options.pop(name) for name in signature(Lens.render).parameters if name in options}
     return load(lens, **options).render(rays, **own)

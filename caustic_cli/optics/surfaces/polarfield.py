@@ -1,18 +1,19 @@
-"""Surfaces around a source, P = r d: the logarithm of the distance r from the origin is a B-spline over directions d.
+"""Surfaces around a source, P = r d: the distance r from the origin is a B-spline over directions d.
 
 Notation
     u, v    stereographic coordinates of a direction, rho^2 = u^2 + v^2: the hemisphere z >= 0 is the disc rho <= 1
     d       unit direction, (2 u, 2 v, 1 - rho^2) / (1 + rho^2)
-    g       log r, r in mm: a spline over the square [-1, 1]^2 with control values (n, m)
+    r       mm: a positive spline over the square [-1, 1]^2 with control values (n, m)
     a, b    unit vectors along d_u and d_v; (a, b, d) is a right-handed orthonormal frame, since the map is conformal:
             |d_u| = |d_v| = 2 / (1 + rho^2)
-    p, q    (1 + rho^2) / 2 (g_u, g_v), the slopes of the surface in that frame
+    p, q    (1 + rho^2) / 2 (r_u, r_v) / r, the slopes of the surface in that frame
 
 The normal is N = d - p a - q b: in the frame (a, b, d) the surface is, to first order, a height field with slopes p, q, so that
 Snell and Fresnel of height fields (`optics.interface`) apply there as they stand.  N . d = 1: seen from the origin no part of the
 surface hides another, and light from there meets every point from within.
 
-Stereographic coordinates have no pole within the hemisphere, and enlarge its rim no more than twofold.
+Stereographic coordinates have no pole within the hemisphere, and enlarge its rim no more than twofold.  P is rational, of degree
+degree + 2 over the same knots: a NURBS surface (`export.lamp_step`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -31,7 +33,7 @@ from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 Vectors = tuple[Tensor, Tensor, Tensor]
-#: Largest number of iterations for an intersection, and error of log r at which it ends: 4 ulp of the largest logarithm.
+#: Largest number of iterations for an intersection, and relative error of r at which it ends.
 MOST_STEPS, ENOUGH = 60, 1e-14
 EXTENT_POINTS = 400
 
@@ -84,7 +86,7 @@ def from_frame(axes: tuple[Vectors, Vectors, Vectors], w: Vectors) -> Vectors:
 @dataclass(frozen=True, eq=False)
 class PolarField:
     """A surface r(u, v) around the origin, over the spline spaces of u and of v on [-1, 1]; methods take control values (n, m) of
-    log r, r in mm.
+    r, mm.
 
     Raises:
         InputError: a space does not belong to [0, 1], see `SplineSpace`.
@@ -100,7 +102,7 @@ class PolarField:
 
     @property
     def net(self) -> HeightField:
-        """log r, a height field over the square."""
+        """r, a height field over the square."""
         return HeightField(self.spaces, (1.0, 1.0))
 
     @property
@@ -116,30 +118,43 @@ class PolarField:
         """
         if not 0 < radius < math.inf:
             raise InputError(f"the radius of a sphere around the source must be greater than 0 mm, got {radius!r}")
-        return torch.full(self.shape, math.log(radius), dtype=torch.float64)
+        return torch.full(self.shape, float(radius), dtype=torch.float64)
 
     def at(self, values: Tensor, u: Tensor, v: Tensor, orders: Sequence[tuple[int, int]] = FIRST) -> list[Tensor]:
-        """Derivatives of g of these orders by u and v at points (N,): (N,) float64 each; linear in the control values."""
+        """Derivatives of r of these orders by u and v at points (N,): (N,) float64 each; linear in the control values."""
         return self.net.at(values, u, v, orders)
+
+    @cached_property
+    def _slope_nets(self) -> tuple[HeightField, HeightField]:
+        """r_u and r_v, height fields over the square of one degree less along u, and along v."""
+        (u, v), square = self.spaces, (1.0, 1.0)
+        return HeightField((u.derivative, v), square), HeightField((u, v.derivative), square)
+
+    def second(self, values: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """r_uu, r_uv, r_vv at points (N,): first derivatives of the splines r_u and r_v."""
+        if min(space.degree for space in self.spaces) == 1:
+            ruu, ruv, rvv = self.at(values, u, v, SECOND)
+            return ruu, ruv, rvv
+        by_u, by_v = (0.5 * space.differences(values, axis) for axis, space in enumerate(self.spaces))
+        _, ruu, ruv = self._slope_nets[0].evaluate(by_u, u, v)
+        return ruu, ruv, self._slope_nets[1].evaluate(by_v, u, v)[2]
 
     def points(self, values: Tensor, u: Tensor, v: Tensor) -> Vectors:
         """P at (u, v), mm."""
-        (g,) = self.at(values, u, v, [(0, 0)])
-        r = torch.exp(g)
+        (r,) = self.at(values, u, v, [(0, 0)])
         x, y, z = (r * d for d in direction_of(u, v))
         return x, y, z
 
     def normals(self, values: Tensor, u: Tensor, v: Tensor) -> Vectors:
         """Unit normals at (u, v), away from the origin."""
-        _, gu, gv = self.at(values, u, v)
-        p, q = slopes(u, v, gu, gv)
+        p, q = slopes(u, v, *self.at(values, u, v))
         k = 1.0 / (1.0 + p * p + q * q).sqrt()
         return from_frame(frame(u, v), (-k * p, -k * q, k))
 
     def hull(self, values: Tensor) -> tuple[float, float]:
         """Least and largest r that bound the surface, mm, by the convex hull property."""
         low, high = torch.aminmax(values.detach())
-        return math.exp(float(low)), math.exp(float(high))
+        return float(low), float(high)
 
     @staticmethod
     def sampled() -> tuple[Tensor, Tensor]:
@@ -151,7 +166,7 @@ class PolarField:
     def extent(self, values: Tensor) -> tuple[float, float]:
         """Least and greatest r on the side z >= 0, mm, at EXTENT_POINTS^2 points."""
         low, high = torch.aminmax(self.net.evaluate(values.detach(), *self.sampled())[0])
-        return math.exp(float(low)), math.exp(float(high))
+        return float(low), float(high)
 
     def from_origin(self, values: Tensor, u: Tensor, v: Tensor) -> PolarHit:
         """Where rays from the origin in these directions meet the surface: always, at r; differentiable by the values."""
@@ -161,7 +176,7 @@ class PolarField:
         """First intersections of rays that start within the surface, of the side z >= 0; differentiable by values, origins and
         directions, once.
 
-        F(t) = log |o + t d| - g(o + t d) is negative at the start and positive beyond the largest distance that the control
+        F(t) = |o + t d| - r(o + t d) is negative at the start and positive beyond the largest distance that the control
         values allow.  Newton's method in that bracket, with bisection where it leaves it.  A ray that meets the surface three times
         may end at any of the crossings of F outwards; `valid` is False where there is no root, or the ray starts outside.
 
@@ -174,33 +189,32 @@ class PolarField:
             o, d = (ox.detach(), oy.detach(), oz.detach()), (dx.detach(), dy.detach(), dz.detach())
             t, valid = self._root(net, o, d)
             at = stereographic(*(s + t * c for s, c in zip(o, d, strict=True)))
-            second = self.at(net, *at, SECOND) if differentiable else None
+            second = self.second(net, *at) if differentiable else None
         here = self.net.evaluate(values, *at)
-        # One Newton step with the derivatives of the root gives t its derivatives by the implicit function theorem; g near the root
+        # One Newton step with the derivatives of the root gives t its derivatives by the implicit function theorem; r near the root
         # is a Taylor polynomial, exact there with its first derivatives by points.
         x, y, z = (s + t * c for s, c in zip(origin, direction, strict=True))
-        (g, _, _), _ = _near(here, second, at, stereographic(x, y, z))
-        f = 0.5 * (x * x + y * y + z * z).log() - g
+        (r, _, _), _ = _near(here, second, at, stereographic(x, y, z))
+        f = (x * x + y * y + z * z).sqrt() - r
         with torch.no_grad():
-            a, b, e = frame(*at)
-            p, q = slopes(*at, here[1], here[2])
-            along = to_frame((a, b, e), d)
-            slope = (along[2] - p * along[0] - q * along[1]) / (x * x + y * y + z * z).sqrt()
+            p, q = slopes(*at, *here)
+            along = to_frame(frame(*at), d)
+            slope = along[2] - p * along[0] - q * along[1]  # there |o + t d| is r
         t = t - torch.where(valid, f / slope, torch.zeros_like(f))
         x, y, z = (s + t * c for s, c in zip(origin, direction, strict=True))
-        (_, gu, gv), (u, v) = _near(here, second, at, stereographic(x, y, z))
-        p, q = slopes(u, v, gu, gv)
+        (r, ru, rv), (u, v) = _near(here, second, at, stereographic(x, y, z))
+        p, q = slopes(u, v, r, ru, rv)
         return PolarHit((x, y, z), u, v, p, q, valid)
 
     def _residual(self, values: Tensor, at, direction) -> tuple[Tensor, Tensor]:
         """F and its derivative by t."""
         x, y, z = at
-        square = x * x + y * y + z * z
+        distance = (x * x + y * y + z * z).sqrt()
         u, v = stereographic(x, y, z)
-        g, gu, gv = self.net.evaluate(values, u, v)
-        p, q = slopes(u, v, gu, gv)
+        r, ru, rv = self.net.evaluate(values, u, v)
+        p, q = slopes(u, v, r, ru, rv)
         along = to_frame(frame(u, v), direction)
-        return 0.5 * square.log() - g, (along[2] - p * along[0] - q * along[1]) / square.sqrt()
+        return distance - r, along[2] - r / distance * (p * along[0] + q * along[1])
 
     def _root(self, values: Tensor, o, d) -> tuple[Tensor, Tensor]:
         """t of the intersection, and whether there is one."""
@@ -221,8 +235,9 @@ class PolarField:
             newton = t - f / slope
             outside = ~((newton > lower) & (newton < upper))  # also where it is not a number
             step = torch.where(outside, 0.5 * (lower + upper), newton)
-            done = (f.abs() <= ENOUGH) | ~valid
-            t = torch.where(f.abs() <= ENOUGH, t, step)
+            close = f.abs() <= ENOUGH * high
+            done = close | ~valid
+            t = torch.where(close, t, step)
             if bool(done.all()):
                 break
         return torch.where(valid, t, torch.zeros_like(t)), valid
@@ -233,27 +248,26 @@ class PolarField:
         r = (x * x + y * y + z * z).sqrt()
         central = r <= 1e-300  # the origin, which has no direction, lies within
         u, v = stereographic(x, y, torch.where(central, torch.ones_like(z), z))
-        return central | (r.log() < self.net.evaluate(values, u, v)[0])
+        return central | (r < self.net.evaluate(values, u, v)[0])
 
 
 def _near(here, second, at: tuple[Tensor, Tensor], to: tuple[Tensor, Tensor]):
-    """g, g_u, g_v at points from those `here`, at coordinates `at`, and second derivatives there, None for zero; and the points."""
-    (g, gu, gv), du, dv = here, to[0] - at[0], to[1] - at[1]
+    """r, r_u, r_v at points from those `here`, at coordinates `at`, and second derivatives there, None for zero; and the points."""
+    (r, ru, rv), du, dv = here, to[0] - at[0], to[1] - at[1]
     if second is None:
-        return (g, gu, gv), to
-    guu, guv, gvv = second
-    return (g + gu * du + gv * dv, gu + guu * du + guv * dv, gv + guv * du + gvv * dv), to
+        return (r, ru, rv), to
+    ruu, ruv, rvv = second
+    return (r + ru * du + rv * dv, ru + ruu * du + ruv * dv, rv + ruv * du + rvv * dv), to
 
 
-def slopes(u: Tensor, v: Tensor, gu: Tensor, gv: Tensor) -> tuple[Tensor, Tensor]:
-    """Slopes p, q in the frame, from the derivatives of log r."""
-    k = 0.5 * (1.0 + u * u + v * v)
-    return k * gu, k * gv
+def slopes(u: Tensor, v: Tensor, r: Tensor, ru: Tensor, rv: Tensor) -> tuple[Tensor, Tensor]:
+    """Slopes p, q in the frame, from r and its derivatives."""
+    k = 0.5 * (1.0 + u * u + v * v) / r
+    return k * ru, k * rv
 
 
-def polar_hit(u: Tensor, v: Tensor, g: Tensor, gu: Tensor, gv: Tensor) -> PolarHit:
-    """Where rays from the origin in directions (u, v) meet a surface with these values and derivatives of log r."""
-    r = torch.exp(g)
-    p, q = slopes(u, v, gu, gv)
+def polar_hit(u: Tensor, v: Tensor, r: Tensor, ru: Tensor, rv: Tensor) -> PolarHit:
+    """Where rays from the origin in directions (u, v) meet a surface with these values and derivatives of r."""
+    p, q = slopes(u, v, r, ru, rv)
     x, y, z = (r * d for d in direction_of(u, v))
     return PolarHit((x, y, z), u, v, p, q, torch.ones_like(r, dtype=torch.bool))

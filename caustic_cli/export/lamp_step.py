@@ -1,0 +1,119 @@
+"""Writer of STEP files (ISO 10303-21, application protocol 214) of the solid of a lamp, exact.
+
+The surface P = r d over stereographic coordinates (u, v) has the homogeneous coordinates
+
+    (2 u r, 2 v r, (1 - u^2 - v^2) r, 1 + u^2 + v^2),
+
+of degree p + 2 along u and v where r is of degree p, and as smooth as r: splines over the knots of r with multiplicities raised by
+2 (Piegl and Tiller, The NURBS Book, 1997, 4.2).  Their control points are found by interpolation at the Greville abscissae, which
+is exact but for rounding.  The surface is trimmed at z = 0, the circle u^2 + v^2 = 1; that edge is interpolated, as of a round lens
+(`step.ring`).  Of the foot below it, the walls are the edges extruded along z, the flange is round.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.export.lamp import flange_radius, rim_points
+from caustic_cli.export.step import (
+    HEAD,
+    OUTLINES,
+    ROUND_UNCERTAINTY,
+    TAIL,
+    Entities,
+    Loop,
+    closed,
+    knot_lists,
+    product,
+    reals,
+    ring,
+    turned,
+    walls,
+)
+from caustic_cli.io.files import atomic_file
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.lamp import surfaces_of
+from caustic_cli.optics.surfaces.polarfield import PolarField
+from caustic_cli.scene import CircularAperture
+from caustic_cli.scene.lamp import Lamp
+
+
+def nurbs(field: PolarField, values: Tensor) -> tuple[tuple[SplineSpace, SplineSpace], np.ndarray, np.ndarray]:
+    """The surface with control values (n, m) of r, mm, as NURBS over [0, 1]^2, the square of (u, v): the spaces along both, poles
+    (N, M, 3) mm, and weights (N, M), positive."""
+    su, sv = (_raised(space) for space in field.spaces)
+    u, v = (2.0 * space.greville - 1.0 for space in (su, sv))
+    r = field.spaces[0].matrix(su.greville) @ values.detach().double() @ field.spaces[1].matrix(sv.greville).T
+    u, v = torch.broadcast_tensors(u[:, None], v[None, :])
+    homogeneous = torch.stack([2.0 * u * r, 2.0 * v * r, (1.0 - u * u - v * v) * r, 1.0 + u * u + v * v], -1)
+    along = su.interpolated(homogeneous.reshape(su.n, -1)).view(su.n, sv.n, 4).transpose(0, 1)
+    control = sv.interpolated(along.reshape(sv.n, -1)).view(sv.n, su.n, 4).transpose(0, 1).numpy()
+    return (su, sv), control[..., :3] / control[..., 3:], control[..., 3]
+
+
+def _raised(space: SplineSpace) -> SplineSpace:
+    """The space of the products of its splines with quadratic polynomials."""
+    knots, times = torch.unique(space.knots, return_counts=True)
+    return SplineSpace(space.degree + 2, knots.repeat_interleave(times + 2))
+
+
+def write_lamp_step(path: Path, lamp: Lamp, field: PolarField, values: Tensor) -> None:
+    """Write the solid atomically; values: control values of r, mm, of one surface or two, see `optics.lamp.sides`."""
+    out, both = Entities(), surfaces_of(lamp, field, values)
+    (rim, hole), shape = (_rim(out, *side) for side in both), OUTLINES[CircularAperture.name]
+    (outer, inner), foot, opening, below = (_surface(out, *side) for side in both), rim, hole, -lamp.base
+    faces = [out.face(outer, out.bound(rim.edges)), out.face(inner, out.bound(turned(hole.edges)), along=False)]
+    if lamp.flange > 0:
+        around = CircularAperture((flange_radius(lamp, *both[0]),) * 2)
+        edge, foot = shape.flat(out, around, 0.0), shape.flat(out, around, below)
+        faces += [_flat(out, 0.0, edge, rim), *shape.walls(out, around, edge, foot)]
+    elif lamp.base > 0:
+        foot = _rim(out, *both[0], below)
+        faces += walls(out, _extruded(out, foot), rim, foot)
+    if lamp.base > 0:
+        opening = _rim(out, *both[1], below)
+        faces += walls(out, _extruded(out, opening), hole, opening, along=False)
+    faces.append(_flat(out, below, foot, opening, up=False))
+    product(out, [closed(out, faces)], ROUND_UNCERTAINTY)
+    with atomic_file(path, "ascii") as file:
+        file.write(HEAD)
+        file.writelines(out.lines)
+        file.write(TAIL)
+
+
+def _surface(out: Entities, field: PolarField, values: Tensor) -> str:
+    """The NURBS surface; its normal is directed away from the origin."""
+    spaces, poles, weights = nurbs(field, values)
+    points = ",".join(f"({','.join(map(out.point, row))})" for row in poles)
+    return out.add(
+        f"(BOUNDED_SURFACE()B_SPLINE_SURFACE({spaces[0].degree},{spaces[1].degree},({points}),.UNSPECIFIED.,.F.,.F.,.F.)"
+        f"B_SPLINE_SURFACE_WITH_KNOTS({','.join(knot_lists(*(s.knots.numpy() for s in spaces)))},.UNSPECIFIED.)"
+        f"GEOMETRIC_REPRESENTATION_ITEM()RATIONAL_B_SPLINE_SURFACE(({','.join(map(reals, weights))}))"
+        "REPRESENTATION_ITEM('')SURFACE())"
+    )
+
+
+def _rim(out: Entities, field: PolarField, values: Tensor, z: float = 0.0) -> Loop:
+    """The edge of a surface in the plane of the chip, or below it at z."""
+
+    def on(t: np.ndarray) -> np.ndarray:
+        return rim_points(field, values, t) + np.array([0.0, 0.0, z])
+
+    return ring(out, on, 8 * max(field.shape))[0]
+
+
+def _extruded(out: Entities, lower: Loop) -> list[str]:
+    """Vertical surfaces over the curves of a ring, whose normals are directed away from the axis."""
+    upwards = out.add(f"VECTOR('',{out.direction((0.0, 0.0, 1.0))},1.)")
+    return [out.add(f"SURFACE_OF_LINEAR_EXTRUSION('',{curve},{upwards})") for curve in lower.curves]
+
+
+def _flat(out: Entities, z: float, around: Loop, hole: Loop, up: bool = True) -> str:
+    """A plane ring between two loops, which looks up or down."""
+    plane = out.plane((0.0, 0.0, z), (0.0, 0.0, 1.0 if up else -1.0), (1.0, 0.0, 0.0))
+    loops = (around.edges, turned(hole.edges)) if up else (turned(around.edges), hole.edges)
+    return out.face(plane, out.bound(loops[0]), out.bound(loops[1], False))

@@ -1,0 +1,179 @@
+"""Photometric files: symmetry, intensities between their angles, a second reader, and targets of lamps."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from caustic_cli import cli
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.lamp import directions_of, pixels_of
+from caustic_cli.io.photometry import Photometry, read_photometry, write_ies, write_ldt
+from caustic_cli.project.photometric_target import angles_of, picture_of
+from caustic_cli.scene.lamp import Goal
+
+PLANES, ANGLES = 15.0 * np.arange(24), 5.0 * np.arange(37)
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def light_of(intensity, planes=PLANES, angles=ANGLES):
+    """A file whose intensity is a function of C and gamma, degrees."""
+    plane, gamma = np.meshgrid(planes, angles, indexing="ij")
+    return Photometry(planes, angles, intensity(plane, gamma), 1000.0, "test")
+
+
+def lopsided(plane, gamma):
+    """No symmetry at all."""
+    return (300.0 + 50.0 * np.cos(np.radians(plane - 40.0)) + 20.0 * np.sin(np.radians(2.0 * plane))) * np.exp(
+        -((gamma / 40.0) ** 2)
+    )
+
+
+#: Symmetry Isym: an intensity that has it.
+SYMMETRIC = {
+    1: lambda plane, gamma: 200.0 * np.exp(-((gamma / 30.0) ** 2)) + 0.0 * plane,
+    2: lambda plane, gamma: (200.0 + 90.0 * np.cos(np.radians(plane))) * np.exp(-((gamma / 30.0) ** 2)),
+    3: lambda plane, gamma: (200.0 + 90.0 * np.sin(np.radians(plane))) * np.exp(-((gamma / 30.0) ** 2)),
+    4: lambda plane, gamma: (200.0 + 90.0 * np.cos(np.radians(2.0 * plane))) * np.exp(-((gamma / 30.0) ** 2)),
+}
+STORED = {1: [0.0], 2: PLANES[:13], 3: PLANES[6:19], 4: PLANES[:7]}
+
+
+def directions(count=500):
+    """Unit vectors (N, 3) of the whole sphere."""
+    found = np.random.default_rng(3).normal(size=(count, 3))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+# Reading
+
+
+@pytest.mark.parametrize("symmetry", SYMMETRIC)
+def test_eulumdat_of_any_symmetry_is_read_as_all_planes(symmetry):
+    whole = light_of(SYMMETRIC[symmetry])
+    write_ldt(Path("whole.ldt"), whole)
+    lines = Path("whole.ldt").read_text("latin-1").splitlines()
+    rows = np.array(lines[42 + 24 + 37 :]).reshape(24, 37)
+    rows = rows[[*range(18, 24), *range(7)]] if symmetry == 3 else rows[np.isin(PLANES, STORED[symmetry])]  # from C 270 to 90
+    lines[2] = f"{symmetry}"
+    Path("part.ldt").write_text("\r\n".join([*lines[: 42 + 24 + 37], *rows.reshape(-1), ""]), "latin-1")
+    part = read_photometry(Path("part.ldt"))
+    assert part.planes.tolist() == PLANES.tolist()
+    np.testing.assert_allclose(part.values, whole.values, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("symmetry", SYMMETRIC)
+def test_lm_63_of_any_symmetry_is_read_as_all_planes(symmetry):
+    whole = light_of(SYMMETRIC[symmetry])
+    stored = np.isin(PLANES, STORED[symmetry])
+    head = f"IES:LM-63-2019\n[LUMINAIRE] half\nTILT=NONE\n1 1000 1 37 {stored.sum()} 1 2 0 0 0\n1 1 0\n"
+    body = [ANGLES, PLANES[stored], *whole.values[stored]]
+    Path("part.ies").write_text(head + "\n".join(" ".join(map(str, row)) for row in body) + "\n")
+    part = read_photometry(Path("part.ies"))
+    assert part.planes.tolist() == (PLANES.tolist() if symmetry > 1 else [0.0, 90.0, 180.0, 270.0])
+    d = directions()
+    np.testing.assert_allclose(part.intensity(d), whole.intensity(d), rtol=1e-6, atol=1e-6)
+
+
+def test_absolute_photometry_has_the_lumens_of_its_light():
+    Path("a.ies").write_text("IES:LM-63-2019\nTILT=NONE\n1 -1 1 3 1 1 2 0 0 0\n1 1 0\n0 90 180\n0\n10 10 10\n")
+    assert read_photometry(Path("a.ies")).lumens == pytest.approx(40.0 * np.pi, rel=1e-9)
+
+
+def test_intensities_are_those_of_the_angles_and_linear_between():
+    light = light_of(lopsided)
+    plane, gamma = np.radians(np.array([30.0, 345.0, 352.5, 37.5])), np.radians(np.array([20.0, 90.0, 10.0, 12.5]))
+    d = np.stack([np.sin(gamma) * np.cos(plane), np.sin(gamma) * np.sin(plane), np.cos(gamma)], 1)
+    v = light.values
+    wanted = [v[2, 4], v[23, 18], 0.5 * (v[23, 2] + v[0, 2]), 0.25 * (v[2, 2] + v[2, 3] + v[3, 2] + v[3, 3])]
+    np.testing.assert_allclose(light.intensity(d), wanted, rtol=1e-9)
+    half = light._replace(angles=ANGLES[:19], values=light.values[:, :19])
+    assert half.intensity(np.array([[0.0, 0.0, -1.0]])) == 0.0
+
+
+def test_another_program_reads_and_writes_the_same():
+    """Only where eulumdat-py is installed."""
+    pyldt = pytest.importorskip("pyldt", exc_type=ImportError)
+    light = light_of(lopsided)
+    write_ldt(Path("a.ldt"), light)
+    read = pyldt.LdtReader.read("a.ldt")
+    np.testing.assert_allclose(np.array(read.intensities), light.values, rtol=1e-6, atol=1e-6)
+    assert read.header.lamp_flux == [1000.0] and read.header.isym == 0
+    for symmetry, intensity in SYMMETRIC.items():
+        read.intensities, read.header.isym = light_of(intensity).values.tolist(), symmetry
+        pyldt.LdtWriter.write(read, f"{symmetry}.ldt")
+        np.testing.assert_allclose(read_photometry(Path(f"{symmetry}.ldt")).values, light_of(intensity).values, atol=0.2)
+
+
+# Targets
+
+
+def test_the_angles_of_a_target_hold_all_light():
+    def box(plane, gamma):
+        d = np.sin(np.radians(gamma)) * np.cos(np.radians(plane)), np.sin(np.radians(gamma)) * np.sin(np.radians(plane))
+        x, y, z = *d, np.cos(np.radians(gamma))
+        return 1.0 * ((z > 0) & (np.abs(np.degrees(np.arctan2(x, z))) <= 50.0) & (np.abs(np.degrees(np.arcsin(y))) <= 20.0))
+
+    width, height = angles_of(light_of(box, 5.0 * np.arange(72), np.arange(181.0)))
+    assert width == pytest.approx(100.0, abs=2.0) and height == pytest.approx(40.0, abs=2.0)
+    with pytest.raises(InputError, match="no light within 90 degrees"):
+        angles_of(light_of(lambda plane, gamma: 1.0 * (gamma > 100.0) + 0.0 * plane))
+    assert max(angles_of(light_of(lambda plane, gamma: 1.0 + 0.0 * plane * gamma))) == 170.0
+
+
+def test_pictures_are_intensities_far_away_and_irradiance_on_a_plane():
+    light = light_of(lopsided, 5.0 * np.arange(72), np.arange(181.0))
+    far, near = Goal((100.0, 60.0)), Goal((4000.0, 2000.0), 2000.0)
+    for goal in (far, near):
+        found = picture_of(light, goal)
+        d = directions_of(goal, pixels_of(goal, 60_000)).numpy()
+        plane, gamma = np.degrees(np.arctan2(d[:, 1], d[:, 0])), np.degrees(np.arccos(d[:, 2]))
+        wanted = lopsided(plane, gamma) * (1.0 if goal is far else d[:, 2] ** 3)
+        np.testing.assert_allclose(found.reshape(-1), wanted, rtol=3e-3, atol=0.05)
+    with pytest.raises(InputError, match="no light on the target"):
+        picture_of(light._replace(values=0.0 * light.values), far)
+
+
+@pytest.mark.parametrize("write", [write_ies, write_ldt])
+def test_a_lamp_throws_the_light_of_a_file(write, capfd):
+    name = {write_ies: "goal.ies", write_ldt: "goal.ldt"}[write]
+    light = light_of(
+        lambda plane, gamma: 300.0 * (1.0 + 0.6 * np.cos(np.radians(plane))) * np.exp(-((gamma / 45.0) ** 4)),
+        5.0 * np.arange(72),
+        np.arange(181.0),
+    )
+    write(Path(name), light)
+    assert cli.run(["design", name, "--lamp", "15", "--lamp-inner", "3", "-o", "far", "--json", "--quiet"]) == 0
+    figures = json.loads(capfd.readouterr().out)
+    assert figures["uniformity"] is None and figures["interior_rms"] < 0.6
+    assert cli.run(["export", "far", "--format", "ldt", "--quiet"]) == 0
+    d = directions(4000)
+    d = d[d[:, 2] > 0.2]
+    one, other = (np.stack(read.intensity(d)) for read in (light, read_photometry(Path("far.ldt"))))
+    turned = read_photometry(Path("far.ldt")).intensity(d * [-1.0, 1.0, 1.0])
+    assert np.corrcoef(one, other)[0, 1] > 0.9 > np.corrcoef(one, turned)[0, 1] + 0.1
+    text = Path("far/project.toml").read_text()
+    assert "angles = [" in text and torch.from_numpy(np.load("far/target.npy")).min() >= 0.0
+
+
+def test_photometric_targets_are_refused_in_one_line(capfd):
+    write_ldt(Path("a.ldt"), light_of(lopsided))
+    Path("bad.ies").write_text("IES:LM-63-2019\nTILT=NONE\n1 x\n")
+    Path("dark.ldt").write_bytes(Path("a.ldt").read_bytes())
+    write_ldt(Path("dark.ldt"), light_of(lambda plane, gamma: 0.0 * plane * gamma))
+    for arguments, words in (
+        (["a.ldt"], "--lamp is needed"),
+        (["bad.ies", "--lamp", "15"], "damaged"),
+        (["dark.ldt", "--lamp", "15"], "no light within 90 degrees"),
+        (["none.ldt", "--lamp", "15"], "none.ldt"),
+    ):
+        assert cli.run(["design", *arguments, "--quiet"]) == 2
+        (line,) = capfd.readouterr().err.splitlines()
+        assert words in line
+    assert not list(Path().glob("*.caustic"))
