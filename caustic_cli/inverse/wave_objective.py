@@ -85,7 +85,7 @@ class WaveObjective:
         self.middle = heights.detach().double().to(device)
         screen = scene.screen.grown((how.apron, how.apron))
         wide = torch.nn.functional.pad(target.double().to(device), (how.apron,) * 4)
-        self.loss = (Loss if target.ndim == 2 else ColorLoss)(loss, wide, how.blur, how.apron, wide > 0)
+        self.loss = (Loss if target.ndim == 2 else ColorLoss)(loss, wide, how.blur, how.apron, wide > 0, how.bright)
         self.penalty = penalty_of(scene, field, loss, limits or Limits(), device)
         lines = lines_of(scene, field, None if scene.light.continuum is None else wavelengths or None)
         rank, count = ranks.rank_and_size()

@@ -490,6 +490,7 @@ class OneSurface(Problem):
             if bound is not None
         }
         evaluation.add_unseen()
+        evaluation.add_beam()
         evaluation.figures |= self.further_figures(designer, evaluation.state)
         return evaluation.result()
 
