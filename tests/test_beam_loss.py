@@ -135,3 +135,27 @@ def test_a_beam_is_shaped_on_the_command_line(tmp_path, monkeypatch, capfd):
     assert "--region must be a number of pixels or a picture, got 'two'" in capfd.readouterr().err
     assert cli.run(["design", "square.npy", *beam, "--loss", "log-rms", "--efficiency", "1.2"]) == 2
     assert "--efficiency" in capfd.readouterr().err
+
+
+def test_error_against_efficiency_and_errors_of_alignment(tmp_path, monkeypatch, capfd):
+    """The less light is asked for the smaller the error; a beam aside or wider has a larger one."""
+    monkeypatch.chdir(tmp_path)
+    x = np.abs(np.linspace(-1, 1, 48))
+    np.save("square.npy", np.outer(x < 0.7, x < 0.7) + 0.0)
+    beam = ["--source", "gaussian", "--waist", "3", "--wavelengths", "1064", "--lens-size", "8", "--throw", "800"]
+    small = ["--linear", "--picture-size", "10x10", "--margin", "0", "--resolution", "48", "--control", "60", "--threads", "1"]
+    assert cli.run(["design", "square.npy", *beam, *small, "--loss", "log-rms", "--waves", "on", "--quiet"]) == 0
+    capfd.readouterr()
+    assert cli.run(["convergence", "square.caustic", "--study", "light", "--seconds", "3", "-o", "light", "--quiet", "--json"]) == 0
+    rows = json.loads((tmp_path / "light" / "light.json").read_text())["rows"]
+    capfd.readouterr()
+    assert [row["weight"] for row in rows] == [0.99, 0.985, 0.97, 0.95, 0.9]
+    assert all(row["on_screen"] > row["weight"] - 0.03 for row in rows)
+    assert rows[-1]["error"] < 0.7 * rows[0]["error"] and any(row["front"] for row in rows)
+    (tmp_path / "errors.toml").write_text("draws = 12\n[source_shift]\nsigma = [0.06, 0.06]\n[source_size]\nhalf_width = 0.05\n")
+    render = ["render", "square.caustic", "--tolerances", "errors.toml", "--rays", "60000", "--quiet", "--threads", "1", "--json"]
+    assert cli.run(render) == 0
+    found = json.loads(capfd.readouterr().out)
+    shown = {row["error"] if "error" in row else row["name"] for row in found["tolerances"]["sensitivities"]}
+    assert {"source_shift", "source_size"} <= {name.split(" ")[0] for name in map(str, shown)} or len(shown) >= 2
+    assert found["tolerances"]["error"]["p95"] > 1.3 * found["wave_relative_rms"]

@@ -81,8 +81,11 @@ class Loss:
         if blur > 0:
             self.blur = tuple(gaussian_matrix(n, blur).to(target) for n in target.shape)
         self.target = target / target.sum()
+        #: First and last pixels along each axis, the latter excluded, outside which light is of no influence; None for all.
+        self.box: tuple[tuple[int, int], tuple[int, int]] | None = None
         if any(name == "log-rms" for _, name in self.terms):
             self.bright = (bright or bright_parts.Region()).on(self.target, apron)
+            self.box = self.bright.box if len(self.terms) == 1 else None
         self.region = target > 0 if region is None else region
         beyond = [
             (torch.arange(n).to(target) - apron - 0.5 * (n - 2 * apron - 1)).abs() - 0.5 * (n - 2 * apron - 1) for n in target.shape
@@ -146,7 +149,7 @@ class ColorLoss:
     def __init__(self, text: str, target: Tensor, blur: float, apron: int, region: Tensor, bright: Region | None = None):
         lit = [k for k, t in enumerate(target) if float(t.sum()) > 0]
         self.channels = [(k, Loss(text, target[k], blur, apron, region[k], bright)) for k in lit]
-        self.target = self.channels[0][1].target
+        self.target, self.box = self.channels[0][1].target, None
 
     def __call__(self, image: Tensor, leaving: Tensor, penalty: Tensor | float = 0.0, entering: Tensor | None = None) -> Tensor:
         """Loss of an image (3, n_x, n_y) by rays that carried `leaving` (3,) of `entering` (3,): scalar, in units of eq. 5.2.1."""

@@ -65,6 +65,13 @@ class Bright:
     mask: Tensor
     region: Tensor
 
+    @property
+    def box(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First and last pixels of both along each axis, the latter excluded."""
+        lit = self.mask | self.region
+        rows, columns = (lit.any(k).nonzero()[:, 0] for k in (1, 0))
+        return (int(rows[0]), int(rows[-1]) + 1), (int(columns[0]), int(columns[-1]) + 1)
+
     def error(self, image: Tensor) -> Tensor:
         """e of an image (n_x, n_y), ()."""
         inside, wanted = image[self.mask], self.target[self.mask]

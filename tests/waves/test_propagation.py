@@ -11,7 +11,7 @@ import torch
 from fields import Given, disc, mean_around, mean_over, middles, slit
 from scipy.special import airy, j0, j1, jv
 
-from caustic_cli.optics.waves.propagation import cells, pixel_edges, power_by_blocks, power_on_pixels
+from caustic_cli.optics.waves.propagation import Exposure, PrunedExposure, cells, pixel_edges, power_by_blocks, power_on_pixels
 from caustic_cli.optics.waves.sampling import Sampling
 
 LAMBDA = 5.5e-4
@@ -301,3 +301,21 @@ def test_single_precision_derivative():
         found.append((phase.grad.double(), amplitude.grad.double()))
     for a, b in zip(*found, strict=True):
         assert float((a - b).norm() / b.norm()) < 1e-5
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_part_of_the_pixels_by_matrix_products(keep):
+    """The same image there as by the whole transform, and the same derivative."""
+    torch.manual_seed(0)
+    phase, amplitude, change = (torch.rand(30, 24, dtype=torch.float64) for _ in range(3))
+    edges = torch.linspace(3.3, 60.1, 21, dtype=torch.float64), torch.linspace(0.0, 80.0, 17, dtype=torch.float64)
+    args, box = (6.0 * phase, amplitude, 3.0, (64, 80), edges), ((4, 15), (0, 9))
+    whole, part, inside = Exposure(*args), PrunedExposure(*args, box), (slice(4, 15), slice(0, 9))
+    image = part.image(change, keep)
+    assert torch.equal(image.nonzero().amax(0), torch.tensor([14, 8]))
+    assert torch.allclose(image[inside], whole.image(change)[inside], atol=1e-13)
+    by_pixel, found, expected = torch.zeros(20, 16, dtype=torch.float64), torch.zeros_like(phase), torch.zeros_like(phase)
+    by_pixel[inside] = torch.rand(11, 9, dtype=torch.float64)
+    part.pull(by_pixel, change, found)
+    whole.pull(by_pixel, change, expected)
+    assert torch.allclose(found, expected, atol=1e-13) and float(expected.abs().max()) > 1.0

@@ -149,3 +149,79 @@ def power_by_blocks(
             at = slice(left + start, left + start + power.shape[1])
             image = image + ((rows @ power) @ columns[:, at].T).double()
     return cast(Tensor, image), whole
+
+
+#: First and last pixels, the latter excluded, along each axis.
+Box = tuple[tuple[int, int], tuple[int, int]]
+#: Flops of a matrix product in the time of one of a Fourier transform.
+PRODUCT = 8.0
+
+
+class PrunedExposure(Exposure):
+    """An `Exposure` of a rectangle of pixels alone; the others remain dark.  Its samples are those of two matrix products,
+
+        U = A_x u A_y^T,    A = exp(-2 pi i j m / N) / sqrt(N)
+
+    over samples j within the rectangle and m of the field.
+
+    Args:
+        box: the rectangle; all others as of an `Exposure`.
+    """
+
+    def __init__(
+        self,
+        phase: Tensor,
+        amplitude: Tensor,
+        factor: float,
+        shape: tuple[int, int],
+        edges: tuple[Tensor, Tensor],
+        box: Box,
+    ):
+        super().__init__(phase, amplitude, factor, shape, edges)
+        self.box, self.kernels, self.masks = box, [], []
+        for count, size, edge, (first, last) in zip(phase.shape, shape, edges, box, strict=True):
+            low, high = samples_of(edge, first, last, size)
+            j = torch.arange(low, high, dtype=torch.float64, device=phase.device)
+            turn = torch.remainder(j[:, None] * torch.arange(count, dtype=torch.float64, device=phase.device) / size, 1.0)
+            self.kernels.append((torch.polar(torch.full_like(turn, size**-0.5), -TURN * turn)).to(_complex(phase.dtype)))
+            self.masks.append(cells(edge.to(phase.device)[first : last + 1] - low, high - low).to(phase))
+        self._kept: Tensor | None = None
+
+    def image(self, change: Tensor, keep: bool = False) -> Tensor:
+        """As of an `Exposure`; not differentiable, but by `pull`."""
+        field = self._field(change)
+        self._kept = field if keep else None
+        power = field.real.square() + field.imag.square()
+        image = power.new_zeros(self.resolution)
+        image[tuple(slice(*ends) for ends in self.box)] = self.masks[0] @ power @ self.masks[1].T
+        return image
+
+    def pull(self, by_pixel: Tensor, change: Tensor, out: Tensor) -> None:
+        """As of an `Exposure`."""
+        field = self._field(change) if self._kept is None else self._kept
+        inner = by_pixel[tuple(slice(*ends) for ends in self.box)].to(self.phase)
+        field = field * (self.masks[0].T @ inner @ self.masks[1])
+        back = (self.kernels[0].mH @ field) @ self.kernels[1].conj()
+        unit = torch.polar(self.amplitude, self.phase + self.factor * change)
+        out += (2.0 * self.factor) * (back * unit.conj()).imag
+        self._kept = None
+
+    def _field(self, change: Tensor) -> Tensor:
+        return (self.kernels[0] @ torch.polar(self.amplitude, self.phase + self.factor * change)) @ self.kernels[1].T
+
+
+def samples_of(edge: Tensor, first: int, last: int, size: int) -> tuple[int, int]:
+    """Samples, the last excluded, in which pixels lie, from their edges (count + 1,) in samples."""
+    return max(0, math.floor(float(edge[first]))), min(size, math.ceil(float(edge[last])))
+
+
+def pruning_pays(shape: tuple[int, int], count: tuple[int, int], edges: tuple[Tensor, Tensor], box: Box) -> bool:
+    """Whether a `PrunedExposure` is faster than an `Exposure`."""
+    lows, highs = zip(*(samples_of(e, *ends, n) for e, ends, n in zip(edges, box, shape, strict=True)), strict=True)
+    a, b = (high - low for low, high in zip(lows, highs, strict=True))
+    (n, m), whole = count, shape[0] * shape[1]
+    return a * m * (n + b) < PRODUCT * whole * math.log2(whole)
+
+
+def _complex(dtype: torch.dtype) -> torch.dtype:
+    return torch.complex64 if dtype == torch.float32 else torch.complex128
