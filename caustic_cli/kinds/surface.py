@@ -216,7 +216,8 @@ class OneSurface(Problem):
         """The control net unless one is given."""
         if d.trained:
             return [NETWORK_CONTROL] * 2
-        spans = d.effort.refinement.spans(max(d.resolution)) if cls.exact_start(d) else DEFAULT_SPANS
+        fine = cls.exact_start(d) and not d.shaped
+        spans = d.effort.refinement.spans(max(d.resolution)) if fine else DEFAULT_SPANS
         return [spans + p for p in d.lens.degree]
 
     @classmethod
@@ -251,7 +252,7 @@ class OneSurface(Problem):
         light that is tilted to the axis the map is solved for the screen's own pixels.
         """
         aligned = d.source.distant and (build_screen(d.s.screen).upright or d.source.oblique)
-        creased = d.gaps >= GAPS and not (d.own_control or waves or cls.spread(d)) and aligned
+        creased = d.gaps >= GAPS and not (d.own_control or waves or d.shaped or cls.spread(d)) and aligned
         if creased:
             d.set_control([creased_control(max(d.resolution), p, d.effort.creased) for p in d.lens.degree])
         return creased

@@ -221,7 +221,8 @@ class SourceSettings(Section):
     power_unit: str = setting("W, or lm for images in lux", choices=("W", "lm"), default="W", written=False)
     profile: str | None = setting("plane: file in this directory with the relative irradiance over the aperture", file="profile")
     file: str | None = setting("ray file (IES TM-25 .tm25ray, Zemax .dat or .sdf, LightTools .ray or .txt), of which the project"
-            " keeps a copy; for a disc, a picture of its brightness with linear values",
+            " keeps a copy; for a disc, a picture of its brightness, for a plane wave one of its irradiance over the aperture, such"
+            " as that of a measured beam, both with linear values",
             option=Option("--source-file", "FILE", BOTH), file="source")
     position: Points | None = setting("point: one or several [x, y, z]; grid, disc: the centre; rays: the file's origin", "mm",
             *DISTANCE, derived="on the axis, five lens widths in front of the lens",

@@ -21,6 +21,7 @@ from caustic_cli.optics.region import Bright
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves.image import Imager, lines_of
+from caustic_cli.optics.waves.propagation import Box, PrunedExposure, samples_of
 from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.scene import Scene
 
@@ -57,17 +58,20 @@ def vortices(scene: Scene, field: HeightField, heights: Tensor, mask: np.ndarray
     imager = Imager.of([line], parameters, receiver_of(line.system, scene.screen))
     front = imager.front(line, imager.modes(line.system)[0], parameters)
     phase, amplitude = imager.field(line, front, torch.float64)
-    rows, columns = (e.numpy() for e in imager.edges(line))
-    u = torch.fft.fft2(torch.polar(amplitude, phase), s=imager.sampling.padded)
-    return turns(u.angle().numpy(), _sampled(mask, rows, columns, imager.sampling.padded))
+    shape, edges = imager.sampling.padded, imager.edges(line)
+    rows, columns = (np.nonzero(mask.any(k))[0] for k in (1, 0))
+    box = (int(rows[0]), int(rows[-1]) + 1), (int(columns[0]), int(columns[-1]) + 1)
+    u = PrunedExposure(phase, amplitude, 0.0, shape, edges, box).field(torch.zeros_like(phase))
+    return turns(u.angle().numpy(), _sampled(mask, edges, shape, box))
 
 
-def _sampled(mask: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """A mask of pixels, between edges in samples, on the samples."""
-    at = [np.searchsorted(edges, np.arange(n) + 0.5, side="right") - 1 for edges, n in zip((rows, columns), shape, strict=True)]
-    inside = [(k >= 0) & (k < n) for k, n in zip(at, mask.shape, strict=True)]
-    found = mask[np.ix_(*(np.clip(k, 0, n - 1) for k, n in zip(at, mask.shape, strict=True)))]
-    return found & inside[0][:, None] & inside[1][None, :]
+def _sampled(mask: np.ndarray, edges: tuple[Tensor, Tensor], shape: tuple[int, int], box: Box) -> np.ndarray:
+    """A mask of pixels, between edges in samples, on the samples of a box of pixels."""
+    at = []
+    for edge, n, ends in zip(edges, shape, box, strict=True):
+        middles = np.arange(*samples_of(edge, *ends, n)) + 0.5
+        at.append((np.searchsorted(edge.numpy(), middles, side="right") - 1).clip(0, len(edge) - 2))
+    return mask[np.ix_(*at)]
 
 
 def turns(phase: np.ndarray, mask: np.ndarray) -> int:

@@ -19,6 +19,7 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.misalignment import Misalignment
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.project.project import Project
 from caustic_cli.scene import CircularAperture, Lens, Light, Offset, Pupil, Scene, Screen
 from caustic_cli.scene.aperture import Aperture
 from caustic_cli.scene.sources.gaussian import Gaussian
@@ -216,6 +217,20 @@ def test_a_beam_on_the_command_line(tmp_path, monkeypatch, capfd):
     assert found["of_source"] <= whole and found["of_source"] == pytest.approx(whole * found["on_target"], rel=1e-3)
     text = (tmp_path / "square.caustic" / "project.toml").read_text()
     assert "waist_at = 50.0" in text and "m2 = 1.2" in text
+
+
+def test_a_measured_beam_is_a_picture(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    np.save("square.npy", np.ones((8, 8)))
+    light = np.exp(-2.0 * np.add.outer(np.linspace(-1, 1, 40) ** 2, np.linspace(-1, 1, 30) ** 2))
+    np.save("beam.npy", light)
+    small = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--waves", "off", "--iterations", "1"]
+    assert cli.run(["design", "square.npy", "--linear", "--source-file", "beam.npy", *small]) == 0
+    assert np.array_equal(Project.open("square.caustic").scene().source.profile, light)
+    capfd.readouterr()
+    (tmp_path / "beam.dat").write_bytes(b"1 2 3")
+    assert cli.run(["design", "square.npy", "--source", "plane", "--source-file", "beam.dat", *small]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
 
 
 def test_the_field_on_a_pupil_is_that_of_its_rays():

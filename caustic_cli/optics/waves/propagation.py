@@ -189,7 +189,7 @@ class PrunedExposure(Exposure):
 
     def image(self, change: Tensor, keep: bool = False) -> Tensor:
         """As of an `Exposure`; not differentiable, but by `pull`."""
-        field = self._field(change)
+        field = self.field(change)
         self._kept = field if keep else None
         power = field.real.square() + field.imag.square()
         image = power.new_zeros(self.resolution)
@@ -198,7 +198,7 @@ class PrunedExposure(Exposure):
 
     def pull(self, by_pixel: Tensor, change: Tensor, out: Tensor) -> None:
         """As of an `Exposure`."""
-        field = self._field(change) if self._kept is None else self._kept
+        field = self.field(change) if self._kept is None else self._kept
         inner = by_pixel[tuple(slice(*ends) for ends in self.box)].to(self.phase)
         field = field * (self.masks[0].T @ inner @ self.masks[1])
         back = (self.kernels[0].mH @ field) @ self.kernels[1].conj()
@@ -206,7 +206,8 @@ class PrunedExposure(Exposure):
         out += (2.0 * self.factor) * (back * unit.conj()).imag
         self._kept = None
 
-    def _field(self, change: Tensor) -> Tensor:
+    def field(self, change: Tensor) -> Tensor:
+        """U, for a change (n, m) mm of the optical paths."""
         return (self.kernels[0] @ torch.polar(self.amplitude, self.phase + self.factor * change)) @ self.kernels[1].T
 
 
