@@ -21,7 +21,7 @@ from caustic_cli.optics.region import Bright
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves.image import Imager, lines_of
-from caustic_cli.optics.waves.propagation import Box, PrunedExposure, samples_of
+from caustic_cli.optics.waves.propagation import PrunedExposure
 from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.scene import Scene
 
@@ -61,17 +61,11 @@ def vortices(scene: Scene, field: HeightField, heights: Tensor, mask: np.ndarray
     shape, edges = imager.sampling.padded, imager.edges(line)
     rows, columns = (np.nonzero(mask.any(k))[0] for k in (1, 0))
     box = (int(rows[0]), int(rows[-1]) + 1), (int(columns[0]), int(columns[-1]) + 1)
-    u = PrunedExposure(phase, amplitude, 0.0, shape, edges, box).field(torch.zeros_like(phase))
-    return turns(u.angle().numpy(), _sampled(mask, edges, shape, box))
-
-
-def _sampled(mask: np.ndarray, edges: tuple[Tensor, Tensor], shape: tuple[int, int], box: Box) -> np.ndarray:
-    """A mask of pixels, between edges in samples, on the samples of a box of pixels."""
-    at = []
-    for edge, n, ends in zip(edges, shape, box, strict=True):
-        middles = np.arange(*samples_of(edge, *ends, n)) + 0.5
-        at.append((np.searchsorted(edge.numpy(), middles, side="right") - 1).clip(0, len(edge) - 2))
-    return mask[np.ix_(*at)]
+    part = PrunedExposure(phase, amplitude, 0.0, shape, edges, box)
+    inside = mask[tuple(part.pixels)]
+    for axis, weight in enumerate(part.weights):
+        inside = inside.repeat(weight.shape[1], axis)
+    return turns(part.field(torch.zeros_like(phase)).angle().numpy(), inside)
 
 
 def turns(phase: np.ndarray, mask: np.ndarray) -> int:
