@@ -38,6 +38,7 @@ from caustic_cli.scene import (
     sources,
 )
 from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.gaussian import Gaussian
 from caustic_cli.scene.sources.section import SourceType
 from caustic_cli.scene.sources.several import Several
 from caustic_cli.studies import verify
@@ -70,6 +71,14 @@ FACTS = {
     "disc of no size": (
         Disc((1.0, 0.0, -8.0), (0.0, 0.0)),
         ("disc", False, False, 0.0, -8.0, (1, 0, -8), 1.0, (0, 0), False, False, False, False),
+    ),
+    "laser": (
+        Gaussian((1.0, 1.0), 1000.0),
+        ("gaussian", True, True, 0.0, -INF, (0, 0, -INF), 1.0, (0, 0), False, False, False, True),
+    ),
+    "focused laser": (
+        Gaussian((1.0, 1.0), 1000.0, 50.0, 2.0, power=2.0),
+        ("gaussian", False, True, 0.07893209471521968, -INF, (0, 0, -INF), 2.0, (0, 0), False, True, False, False),
     ),
     "sun": (Disc(angle=0.5, power=2.0), ("disc", False, True, 0.25, -INF, (0, 0, -INF), 2.0, (0, 0), False, True, False, False)),
 }
@@ -162,6 +171,7 @@ TABLE = Distribution((0.0, 60.0, 120.0), (1.0, 1.0, 0.0))
     [
         (PlaneWave(), 1.0, "through the aperture"),
         (Disc(angle=0.5), 1.0, "through the aperture"),
+        (Gaussian((10.0, 10.0), 500.0), math.erf(math.sqrt(0.5)) ** 2, "in the whole beam"),
         (Points(((0.0, 0.0, -20.0),)), 0.5 * (1.0 - math.cos(CORNER)), "in all directions, uniform"),
         (Points(((0.0, 0.0, -20.0),), cone=10.0), 1.0, "in its cone"),
         (Points(((0.0, 0.0, -20.0),), intensity="lambertian"), math.sin(CORNER) ** 2, "in all directions, Lambertian"),
@@ -216,14 +226,14 @@ def test_sources_without_their_extent():
 
 
 def test_the_types_and_their_keys():
-    assert sources.names() == ("plane", "point", "grid", "disc", "rays")
+    assert sources.names() == ("plane", "point", "grid", "disc", "gaussian", "rays")
     assert sources.used_by("position") == ("point", "grid", "disc", "rays") and sources.used_by("profile") == ("plane",)
     assert sources.used_by("size") == ("grid", "disc") and sources.used_by("grid") == ("grid",)
     assert sources.used_by("polarisation") == ()  # of any light
     known = set(settings.SCHEMA["source"])
     for name in sources.names():
         assert {*sources.type_of(name).keys, *sources.COMMON} <= known
-    with pytest.raises(InputError, match=r"\[source\] type must be one of plane, point, grid, disc, rays, got 'sun'"):
+    with pytest.raises(InputError, match=r"\[source\] type must be one of plane, point, grid, disc, gaussian, rays, got 'sun'"):
         sources.type_of("sun")
 
 

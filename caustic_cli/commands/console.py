@@ -245,6 +245,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         ("relative RMS error", _error(figures, by_waves)),
         *_of_start(figures),
         *_limits(figures),
+        *_of_beam(figures),
         *([] if by_waves else [("loss (eq. 5.2.1)", _number(figures, "loss", ".4e"))]),
         *_of_image(figures, "wave_" if by_waves else ""),
         *_of_radius(figures),
@@ -321,6 +322,19 @@ def _limits(figures: dict) -> list[tuple[str, str]]:
     if "etendue_limit" in figures:
         rows.append(("etendue limit", _number(figures, "etendue_limit", ".2%") + " of the light on the lens"))
     return rows
+
+
+def _of_beam(figures: dict) -> list[tuple[str, str]]:
+    """Figures of a shaped laser beam."""
+    if "beam" not in figures:
+        return []
+    of = figures["beam"]
+    zeros = f", {of['vortices']} vortices" if "vortices" in of else ""
+    return [
+        ("error in the mask", f"{of['error']:.4f} of the picture there; peak to valley {of['peak_to_valley']:.4f}{zeros}"),
+        ("light in the mask", f"{of['in_mask']:.2%} of that behind the lens; {of['in_region']:.2%} in the region"),
+        ("width of its edges", f"{of['edge_width']:.4g} mm, from 1/e² to 1 - 1/e² of the irradiance within"),
+    ]
 
 
 def _of_image(figures: dict, prefix: str) -> list[tuple[str, str]]:

@@ -27,7 +27,7 @@ TAKERS: dict[str, Sequence[str]] = {
     "block": MOULDS,
     "samples": [name for name in FORMATS if name not in UNSAMPLED],
     "tolerance": WITHIN,
-    "max_size": [name for name in FORMATS if name != "gcode"],
+    "max_size": [name for name in FORMATS if name not in ("phase", "gcode")],
     "script": ("lighttools",),
     "milling": ("gcode",),
 }

@@ -129,6 +129,11 @@ angles with half of the peak or more in the planes of x and of y. flux and peak_
 The same quantities for the wave image, where diffraction is simulated; number of details across the picture that the light can
 resolve.
 .TP
+.B beam
+Of a design with the loss log-rms: error, the relative error sqrt(mean((I - T)^2 / T^2)) in the mask, where the picture is above
+10 % of its peak, with I scaled to the same sum there; in_mask and in_region, fractions of the light behind the lens; peak_to_valley
+and rms of I / T in the mask; edge_width, mm, from 1/e^2 to 1 - 1/e^2; and vortices, zeros of the field in the mask.
+.TP
 .B least_relative_rms, etendue_limit
 For an extended source: a lower bound of the error of any lens, by its blur, and the largest fraction of the light that
 \['e]tendue permits.

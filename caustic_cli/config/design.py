@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 
 from caustic_cli.config.default_stages import stage_base
 from caustic_cli.config.settings import Settings, build_screen, build_source
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.constraints import Limits
+from caustic_cli.inverse.loss_terms import parse
 from caustic_cli.inverse.parametrisation import Architecture, Parametrisation
 from caustic_cli.inverse.problem import Options
 from caustic_cli.inverse.schedule import LossImage, Stage
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.region import Region
 from caustic_cli.scene import Screen
-from caustic_cli.schema.table import StageSettings, check_all
+from caustic_cli.scene.sources.section import content
+from caustic_cli.schema.table import DesignSettings, StageSettings, check_all
 
 
 def relative_to_initial(design: Mapping[str, Any]) -> bool:
@@ -56,6 +60,21 @@ def build_stages(settings: Settings) -> list[Stage]:
     return stages
 
 
+def region_of(design: DesignSettings) -> Region | None:
+    """Where the loss log-rms looks for light; None for another loss.
+
+    Raises:
+        InputError: neither pixels nor a picture.
+    """
+    if "log-rms" not in [name for _, name in parse(design.loss)]:
+        return None
+    check_all("design", design, "efficiency")
+    given = content(design, "region", np.ndarray)
+    if given is None and not design.region.isdecimal():
+        raise InputError(f"⟨design.region⟩ must be a number of pixels or a picture, got {design.region!r}")
+    return Region(design.efficiency, 0 if given is not None else int(design.region), given)
+
+
 def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
     """The stage of a table of complete settings."""
     t = StageSettings(stage_base(settings, "grid"), table)
@@ -64,7 +83,7 @@ def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
         t.control,
         t.rays,
         t.sampler,
-        LossImage(filter, t.blur, t.apron, t.oversample, settings.design.filter_target),
+        LossImage(filter, t.blur, t.apron, t.oversample, settings.design.filter_target, region_of(settings.design)),
         t.iterations,
         t.tolerance,
         None if t.source is None else build_source(settings.source, type=t.source),

@@ -18,6 +18,7 @@ FORMATS = {
     "csv": (".csv", "points", "points of the exit surface"),
     "xyz": (".xyz", "points", "points of the exit surface"),
     "heightmap": (".tif", "heightmap", "32-bit TIFF, or .png of 16 bits, with a JSON of its scale"),
+    "phase": (".phase.png", "phase", "wrapped phase, 16 bits, with .npy, JSON and the relief of a kinoform beside it"),
     "gcode": (".nc", "milling.gcode", "program for a three-axis mill"),
     "mitsuba": (".xml", "mitsuba", "the whole scene for Mitsuba 3, ready to run, with two meshes beside it"),
 }
@@ -33,6 +34,7 @@ MOST_BYTES = 100_000_000
 KEEPERS = ("lighttools", "step", "heightmap")
 #: Further suffixes of formats.
 ALSO = {
+    "phase": (".png",),
     "step": (".stp",),
     "heightmap": (".tiff", ".png"),
     "gcode": (".ngc", ".tap", ".gcode", ".cnc"),

@@ -26,6 +26,13 @@ SOURCE = "⟨format⟩ {format} does not support sources of type {scene.source.k
 _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     "zemax": {"other elements": ONE_LENS},
     "lighttools": {"user-defined source": SOURCE},
+    "phase": {
+        **dict.fromkeys(
+            ("mirror", "gradient index", "other elements", "folded axis", "two sides", "several sources"),
+            "⟨format⟩ phase is that of one lens for one source, not of {}",
+        ),
+        **dict.fromkeys(("ray file", "curved screen"), "⟨format⟩ phase needs a wave image, which there is none of with {}"),
+    },
     "mitsuba": {
         **dict.fromkeys(
             [name for name in BEYOND_CLEAR if name not in ("mirror", "gradient index", "tilted screen", "shifted screen")],

@@ -135,6 +135,9 @@ def _extrapolated(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.nd
 
 def _from_source(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit directions of the light of the source's centre at points (a, b) of the pupil, mm."""
+    if scene.source.beam:
+        dx, dy, dz = (c + 0.0 * a for c in scene.source.beam(a, b, scene.pupil).directions)
+        return dx, dy, dz
     if scene.source.distant:
         dx, dy, dz = (np.full_like(a, c) for c in scene.source.axis)
         return dx, dy, dz
@@ -146,19 +149,36 @@ def _from_source(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray
 
 def _tilted(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
     """`incident` of light from infinity along the source's axis: that of its profile where it crossed the entrance."""
-    lens, profile = scene.lens, scene.source.profile
-    kx, ky = slopes_inside(scene.source.axis, lens.inside)
+    lens, source = scene.lens, scene.source
+    kx, ky = slopes_inside(source.axis, lens.inside)
     depth = z - lens.pupil.z
     crossed = [cell_means(c + 0.0 * depth) for c in (x[:, None] - kx * depth, y[None, :] - ky * depth)]
     zx, zy = np.gradient(z, x, y)
     light = cell_means(1.0 - kx * zx - ky * zy)  # D . N, see `optics.beam`
     for inside, step in zip(lens.opening.edges(*crossed, lens.half_size), (x[1] - x[0], y[1] - y[0]), strict=True):
         light *= 1.0 if inside is None else np.clip(inside / step + 0.5, 0.0, 1.0)  # the lit part of a cell at the edge
-    if profile is not None:
-        at = ((0.5 * (c / r + 1.0) * n).astype(int) for c, r, n in zip(crossed, lens.half_size, profile.shape, strict=True))
-        light *= profile[tuple(np.clip(i, 0, n - 1) for i, n in zip(at, profile.shape, strict=True))]
+    if source.uneven:
+        light *= source.irradiance(*crossed, lens.pupil)
     over = 1.0 / math.sqrt(1.0 + kx * kx + ky * ky)
     return light, tuple(np.full_like(z, c * over) for c in (kx, ky, 1.0))
+
+
+def _of_beam(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
+    """`incident` of a laser beam along z, by the normals of its wavefront at the entrance."""
+    source, lens = scene.source, scene.lens
+    assert source.beam is not None
+    pupil, at, depth = lens.pupil, list(np.broadcast_arrays(x[:, None], y[None, :])), z - lens.pupil.z
+    goal = list(at)
+    for _ in range(PASSES):
+        inside = slopes_inside(source.beam(*at, pupil).directions, lens.inside)
+        at = [c - k * depth for c, k in zip(goal, inside, strict=True)]
+    growth = np.gradient(at[0], x, axis=0) * np.gradient(at[1], y, axis=1)
+    light = cell_means(source.irradiance(*at, pupil) * growth)
+    if source.collimated:
+        return light, None
+    kx, ky = slopes_inside(source.beam(*at, pupil).directions, lens.inside)
+    over = 1.0 / np.sqrt(1.0 + kx * kx + ky * ky)
+    return light, (kx * over, ky * over, over)
 
 
 def lit_rectangle(
@@ -221,6 +241,8 @@ def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     source, lens, shape = scene.source, scene.lens, (len(x) - 1, len(y) - 1)
     if source.oblique:
         return _tilted(scene, x, y, z)
+    if source.beam:
+        return _of_beam(scene, x, y, z)
     if source.distant:
         profile = source.profile
         return (np.ones(shape) if profile is None else resampled(profile, shape)), None

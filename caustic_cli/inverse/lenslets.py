@@ -38,7 +38,10 @@ NEEDS_DISTANT_SOURCE = (
     "⟨lens.array⟩ needs light from infinity, which reaches every lenslet alike: ⟨+source.type⟩ plane, or a disc with"
     " ⟨+source.angle⟩"
 )
-LENSLETS = Capability("lenslet arrays", {"near source": NEEDS_DISTANT_SOURCE})
+LENSLETS = Capability(
+    "lenslet arrays",
+    {"near source": NEEDS_DISTANT_SOURCE, "user-defined source": "⟨lens.array⟩ is not for sources of type {scene.source.kind}"},
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import math
 
 from caustic_cli.errors import InputError
 
-LOSSES = ("rms", "rms-light", "throughput", "light", "diffusion", "uniformity")
+LOSSES = ("rms", "rms-light", "throughput", "light", "diffusion", "uniformity", "log-rms")
 PENALTIES = ("laplacian", "curvature")
 
 

@@ -10,6 +10,10 @@ Every term is a dimensionless root mean square t; r is the relative residual N (
                 its distance, as in throughput, so that there is a gradient
     diffusion   the Laplacian of r, with P = P_out: penalises errors of high spatial frequency
     uniformity  standard deviation of J over its mean where the target is not dark (5.2)
+    log-rms     the least relative error inside the picture at a given fraction of the light, for laser beams, see `Region`:
+                t^2 = log(1 + e^2 / e_0^2) + w max(0, a + m - b)^2, with e the relative error in the mask, b the fraction in the
+                region of the light that leaves the lens, a its goal and m a margin.  The second term, of rank one, acts below the
+                goal alone; the logarithm keeps the first in proportion to it at every error.  Light outside the region is free
     laplacian, curvature    of the lens, see `penalties`
 
 Image and target may both be blurred, J -> G_x J G_y^T, so that the residual is compared at a coarser scale.
@@ -18,12 +22,22 @@ Image and target may both be blurred, J -> G_x J G_y^T, so that the residual is 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.loss_terms import LOSSES, parse
+from caustic_cli.loading import OnDemand
+
+if TYPE_CHECKING:
+    from caustic_cli.optics.region import Region
+
+bright_parts = OnDemand("caustic_cli.optics.region")
+
+#: e_0, an error too small to matter; w and m of log-rms.
+LEAST, WEIGHT, BEYOND = 1e-4, 1e6, 3e-4
 
 
 class NoLight(CausticError):
@@ -50,14 +64,28 @@ class Loss:
         blur: standard deviation, pixels, of the Gaussian that image and target are blurred by; 0 for none.
         apron: pixels on each side that do not belong to the screen.
         region: (n_x, n_y) bool, where `uniformity` is evaluated; None for where the target is not dark.
+        bright: where log-rms looks for light, and for how much; None for the default.
     """
 
-    def __init__(self, text: str, target: Tensor, blur: float = 0.0, apron: int = 0, region: Tensor | None = None):
+    def __init__(
+        self,
+        text: str,
+        target: Tensor,
+        blur: float = 0.0,
+        apron: int = 0,
+        region: Tensor | None = None,
+        bright: Region | None = None,
+    ):
         self.terms = [(weight, name) for weight, name in parse(text) if name in LOSSES and weight > 0]
         self.blur = None
         if blur > 0:
             self.blur = tuple(gaussian_matrix(n, blur).to(target) for n in target.shape)
         self.target = target / target.sum()
+        #: First and last pixels along each axis, the latter excluded, outside which light is of no influence; None for all.
+        self.box: tuple[tuple[int, int], tuple[int, int]] | None = None
+        if any(name == "log-rms" for _, name in self.terms):
+            self.bright = (bright or bright_parts.Region()).on(self.target, apron)
+            self.box = self.bright.box if len(self.terms) == 1 else None
         self.region = target > 0 if region is None else region
         beyond = [
             (torch.arange(n).to(target) - apron - 0.5 * (n - 2 * apron - 1)).abs() - 0.5 * (n - 2 * apron - 1) for n in target.shape
@@ -91,6 +119,10 @@ class Loss:
             return (image * self.distance).sum() / (self.apron * leaving)
         if name == "light":
             return 1.0 - (image * (1.0 - self.distance / max(self.apron, 1))).sum() / entering
+        if name == "log-rms":
+            error, part = self.bright.error(image), self.bright.efficiency(image) / leaving
+            short = (self.bright.goal + BEYOND - part).clamp_min(0.0)
+            return torch.log1p((error / LEAST) ** 2) + WEIGHT * short * short
         if name == "uniformity":
             inside = image[self.region]
             if not float(inside.detach().sum()) > 0:  # a black region would count as uniform
@@ -114,10 +146,10 @@ class ColorLoss:
         target, region: (3, n_x, n_y); all others as of `Loss`.
     """
 
-    def __init__(self, text: str, target: Tensor, blur: float, apron: int, region: Tensor):
+    def __init__(self, text: str, target: Tensor, blur: float, apron: int, region: Tensor, bright: Region | None = None):
         lit = [k for k, t in enumerate(target) if float(t.sum()) > 0]
-        self.channels = [(k, Loss(text, target[k], blur, apron, region[k])) for k in lit]
-        self.target = self.channels[0][1].target
+        self.channels = [(k, Loss(text, target[k], blur, apron, region[k], bright)) for k in lit]
+        self.target, self.box = self.channels[0][1].target, None
 
     def __call__(self, image: Tensor, leaving: Tensor, penalty: Tensor | float = 0.0, entering: Tensor | None = None) -> Tensor:
         """Loss of an image (3, n_x, n_y) by rays that carried `leaving` (3,) of `entering` (3,): scalar, in units of eq. 5.2.1."""

@@ -134,7 +134,7 @@ class Channel:
             fine = wide.repeat_interleave(how.oversample, -2).repeat_interleave(how.oversample, -1)
             colors = [how.filter.smooth(c) for c in fine.reshape(-1, *fine.shape[-2:])]
             smooth = self._pool(torch.stack(colors).view(fine.shape), 1)
-        self.loss = (Loss if target.ndim == 2 else ColorLoss)(loss, smooth, how.blur, how.apron, wide > 0)
+        self.loss = (Loss if target.ndim == 2 else ColorLoss)(loss, smooth, how.blur, how.apron, wide > 0, how.bright)
         cells = how.oversample // self.cut
         self.shape = (*target.shape[:-2], *(n // cells for n in self.screen.resolution))
 

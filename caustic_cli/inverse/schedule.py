@@ -7,12 +7,16 @@ stage, so that the loss has a gradient towards features not yet reached.  Each s
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.scene import Source
 from caustic_cli.schema import checks
 from caustic_cli.schema.table import check_all, default
+
+if TYPE_CHECKING:
+    from caustic_cli.optics.region import Region
 
 #: Rays whose cost equals that of the Fourier transform at one wavelength of a typical scene.
 RAYS_A_WAVE = 600_000
@@ -33,6 +37,8 @@ class LossImage:
     oversample: int = default("design.stages.oversample")
     #: Whether the target is filtered as the render is.
     filter_target: bool = True
+    #: Of the loss log-rms, see `losses`; None for its default.
+    bright: Region | None = None
 
     def __post_init__(self):
         check_all("design.stages", self, "blur", "apron", "oversample")

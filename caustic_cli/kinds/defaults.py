@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any
 
 from caustic_cli.config.default_stages import RAYS_PER_PIXEL, Table, completed_stage, usual_sampler
-from caustic_cli.config.design import relative_to_initial
+from caustic_cli.config.design import region_of, relative_to_initial
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen
 from caustic_cli.effort import DRAFT, EFFORTS, FINE, STANDARD, Effort, current_effort
 from caustic_cli.errors import InputError
@@ -108,6 +108,11 @@ class Defaults:
     def plain(self) -> bool:
         """Whether the heights themselves are optimised, by L-BFGS."""
         return not self.trained and self.design.optimizer == "lbfgs"
+
+    @property
+    def shaped(self) -> bool:
+        """Whether a laser beam is shaped, whose diffraction carries no detail finer than a coarse net's."""
+        return region_of(self.design) is not None
 
     @property
     def from_surface(self) -> bool:

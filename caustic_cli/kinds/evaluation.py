@@ -23,6 +23,7 @@ from caustic_cli.studies.retrace import evaluation_rays, retrace
 from caustic_cli.studies.viewing import tristimulus_values
 
 by_waves = OnDemand("caustic_cli.studies.waves")
+beams = OnDemand("caustic_cli.studies.beam")
 
 #: Losses that measure the error of the picture alone; others may increase it in exchange for another objective.
 LIKENESS = {"rms", "rms-light", "throughput"}
@@ -107,6 +108,16 @@ class LensEvaluation:
             required=problem.options.waves,
         )
         return Seen(exposure, light, figures | more)
+
+    def add_beam(self) -> None:
+        """Add the figures of a shaped beam, where the loss is that of one."""
+        if (how := self.problem.stages[-1].rendering.bright) is None or self.target.ndim > 2:
+            return
+        bright, scene, seen = how.on(self.problem.target), self.problem.scene, self.light or self.exposure
+        self.figures["beam"] = beams.beam_figures(seen.image, float(seen.leaving), bright, scene.screen.pixel)
+        if self.light is not None and scene.screen.upright:
+            heights = self.state.heights
+            self.figures["beam"]["vortices"] = beams.vortices(scene, self.field, heights, bright.mask.numpy())
 
     @property
     def few(self) -> tuple[float, ...]:

@@ -179,7 +179,7 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
         return torch.where(square > 0, value, torch.ones_like(value))
 
     both = part(inside + lean) * part(inside + 2.0 * lean)
-    even = scene.axial and scene.source.profile is None and not lens.opening.round
+    even = scene.axial and not scene.source.uneven and not lens.opening.round
     return float((both * area).sum() if even else both.max())
 
 

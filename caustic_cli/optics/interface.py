@@ -14,8 +14,7 @@ Light from above the surface (side -1) is treated as light from below at the sur
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -152,8 +151,8 @@ def reflectance(kind: str, c, s, eta: float | Tensor):
     return 0.5 * (rs + rp)
 
 
-def slopes_inside(direction: tuple[float, float, float], n: float) -> tuple[float, float]:
-    """Slopes k_x, k_y to z of light along a unit vector, behind a flat entrance into n times the index."""
+def slopes_inside(direction: tuple[Any, Any, Any], n: float) -> tuple[Any, Any]:
+    """Slopes k_x, k_y to z of light along a unit vector, of numbers or of arrays, behind a flat entrance into n times the index."""
     x, y, _ = direction
-    along = math.sqrt((n - 1.0) * (n + 1.0) + direction[2] ** 2)
+    along = ((n - 1.0) * (n + 1.0) + direction[2] ** 2) ** 0.5
     return x / along, y / along

@@ -26,7 +26,6 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import Rays, of_member
 from caustic_cli.optics.emission.base import relative_flux
-from caustic_cli.optics.emission.parallel import mean_irradiance
 from caustic_cli.optics.frames import Pose, rotate_to_global, rotate_to_local
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.resampling import displaced
@@ -154,9 +153,8 @@ class Misalignment:
         another part passes the aperture; or the radiant intensity of a near source whose cone is the narrowest that covers the
         lens, since that cone changes with the source's position."""
         before = scene.source
-        if before.profile is not None and changed.source.profile is not None:
-            after, whole = (mean_irradiance(one, scene.pupil.aperture) for one in (changed.source.profile, before.profile))
-            return after / whole
+        if before.uneven:
+            return changed.source.passed(scene.pupil) / before.passed(scene.pupil)
         if before.distant or before.cone is not None or before.rays is not None:
             return 1.0
         after, whole = (relative_flux(s.source, s.source.cone_over(s.lens.pupil)) for s in (changed, scene))
@@ -224,7 +222,7 @@ def landing_points(
 def reason_ignored(scene: Scene, error: str) -> str:
     """Why an error has no effect in a scene; "" if it has one."""
     source = scene.source
-    if error == "source_shift" and source.distant and all(one.profile is None for one in source.members):
+    if error == "source_shift" and source.distant and not any(one.uneven for one in source.members):
         return "a source at infinity without a profile has no position; source_tilt is its direction"
     if error == "source_distance" and source.distant:
         return "a source at infinity has no position; source_tilt is its direction"

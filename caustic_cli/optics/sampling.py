@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -162,8 +162,9 @@ class Sampler:
     shape: tuple[int, int]
     #: Of the random kinds.
     seed: int = 0
-    #: Relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3, erratum E19).
-    profile: Tensor | None = None
+    #: Relative irradiance over the aperture, as a function of u and v that can be broadcast, or (a, b), constant per cell; or None
+    #: (eq. 4.2.3, erratum E19).
+    profile: Callable[[Tensor, Tensor], Tensor] | Tensor | None = None
     #: Where the samples live.
     device: str | torch.device = "cpu"
     #: Of any half widths.
@@ -228,7 +229,9 @@ class Sampler:
 
     def _profile(self, s: Sample) -> Tensor:
         assert self.profile is not None
+        u, v = (s.u[:, None], s.v[None, :]) if s.tensor else (s.u, s.v)
+        if not isinstance(self.profile, Tensor):
+            return self.profile(u, v)
         profile = self.profile.to(self.device, torch.float64)
-        a = (s.u * profile.shape[0]).long().clamp_max(profile.shape[0] - 1)
-        b = (s.v * profile.shape[1]).long().clamp_max(profile.shape[1] - 1)
-        return profile[a[:, None], b[None, :]] if s.tensor else profile[a, b]
+        a, b = ((c * n).long().clamp_max(n - 1) for c, n in zip((u, v), profile.shape, strict=True))
+        return profile[a, b]

@@ -181,6 +181,7 @@ READERS: dict[str, Callable[[Path, Given], _Read]] = {
     "screen.shape_file": _sags,
     "second.file": _second,
     "design.robust": _errors,
+    "design.region": _profile,
 }
 
 

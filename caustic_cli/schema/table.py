@@ -213,14 +213,16 @@ class SourceSettings(Section):
         return self.get("also", ())
 
     type: str = setting("plane: collimated light along +z over the aperture; point; grid of points; disc, an extended source; rays,"
-            " a ray file", default="plane", why="the thesis' first source, section 4.2.1", option=Option("--source", commands=BOTH))
+            " a ray file; gaussian, the beam of a laser", default="plane", why="the thesis' first source, section 4.2.1",
+            option=Option("--source", commands=BOTH))
     power: float = setting("total power of the source, through the aperture or into the cone; in lm, images are in lux", "W", 0.0,
             checks.POWER, above=True, default=1.0, why="images are fractions of the source's power",
             option=Option("--power", "NUMBER[W|lm]", BOTH), speaks_for=("source.power_unit",))
     power_unit: str = setting("W, or lm for images in lux", choices=("W", "lm"), default="W", written=False)
     profile: str | None = setting("plane: file in this directory with the relative irradiance over the aperture", file="profile")
     file: str | None = setting("ray file (IES TM-25 .tm25ray, Zemax .dat or .sdf, LightTools .ray or .txt), of which the project"
-            " keeps a copy; for a disc, a picture of its brightness with linear values",
+            " keeps a copy; for a disc, a picture of its brightness, for a plane wave one of its irradiance over the aperture, such"
+            " as that of a measured beam, both with linear values",
             option=Option("--source-file", "FILE", BOTH), file="source")
     position: Points | None = setting("point: one or several [x, y, z]; grid, disc: the centre; rays: the file's origin", "mm",
             *DISTANCE, derived="on the axis, five lens widths in front of the lens",
@@ -238,6 +240,14 @@ class SourceSettings(Section):
             " as a ray file is, with its position, about the lens' origin; the screen of a new design stands square to it unless"
             " told otherwise, that of a finished lens stays", "degrees", -80.0, 80.0, default=[0.0, 0.0], written=False,
             option=Option("--source-tilt", "A,B", BOTH))
+    waist: Pair | None = setting("gaussian: radius of the waist, at which the irradiance is 1/e² of its peak", "mm", 0.0, 1e6,
+            above=True, option=Option("--waist", "W0[xWY]", BOTH))
+    waist_at: float = setting("gaussian: distance of the waist behind the entrance, negative in front of it", "mm", *DISTANCE,
+            default=0.0, written=False, why="a collimated beam",
+            option=Option("--waist-at", "Z", BOTH))
+    m2: float = setting("gaussian: beam quality factor M² along both axes, of an incoherent superposition of beams of one waist"
+            " (Gaussian Schell model)", "", 1.0, 1000.0, default=1.0, written=False, why="the beam of a single-mode laser",
+            option=Option("--m2", "NUMBER", BOTH))
     direction: Point | None = setting("that direction as a vector [x, y, z] of any length, z > 0, instead of tilt, as which a"
             " project keeps it")
     intensity: str = setting("angular distribution of a point, grid or disc: uniform in solid angle, lambertian, a .csv of"
@@ -492,8 +502,17 @@ class DesignSettings(Section):
         return self.get("stages", ())
 
     loss: str = setting("weighted sum of rms (eq. 5.2.1), rms-light (including light off the screen), throughput, light (light off"
-            " the screen), diffusion, uniformity, laplacian, curvature: 'rms-light + 0.01 laplacian'", default="rms-light",
+            " the screen), diffusion, uniformity, laplacian, curvature: 'rms-light + 0.01 laplacian'; or log-rms, for a laser beam"
+            " the least relative error within the picture at a given fraction of the light (design.efficiency), the rest of which"
+            " may lie anywhere", default="rms-light",
             why="eq. 5.2.1 alone is reduced by sending light off the screen", option=Option("--loss"))
+    efficiency: float = setting("log-rms: fraction of the light behind the lens that is to land in the region", "", 0.0, 1.0,
+            above=True, default=0.97, written=False, why="the error falls steeply down to there, and slowly below",
+            option=Option("--efficiency", "FRACTION"))
+    region: str = setting("log-rms: the region in which light is free to depart from the picture: a number of pixels by which the"
+            " picture above 10 % of its peak is dilated, or a picture as wide as the screen whose lit pixels are the region",
+            default="0", written=False, why="all the light is to be in the picture", option=Option("--region", "PIXELS|FILE"),
+            file="region")
     max_slope: float = setting("largest slope of the surface, mm per mm; 0 for no limit", low=0.0, default=0.0,
             option=Option("--max-slope"))
     min_radius: float = setting("least radius of curvature of concave regions, such as a tool's; 0 for no limit", "mm", 0.0,

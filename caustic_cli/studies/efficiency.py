@@ -35,12 +35,13 @@ RAYS_PER_PIXEL = 64
 COLUMNS = {
     "series": "thickness of the design, mm",
     "thickness": "the same, mm",
-    "weight": "of the term `light` of the loss, relative to `rms`",
+    "weight": "of the term `light` of the loss, relative to `rms`; of log-rms the efficiency that is asked for",
     "loss": "loss of the design",
-    "error": "relative RMS between the retraced image and the target, each over its own mean",
+    "error": "relative RMS between the retraced image and the target, each over its own mean; of log-rms the relative error in the"
+    " mask, by waves",
     "noise": "standard error of `error`",
-    "on_screen": "fraction of the source's power on the screen",
-    "of_source": "fraction of all that the source emits which lands on the picture",
+    "on_screen": "fraction of the source's power on the screen; of log-rms, of the light behind the lens in the region",
+    "of_source": "fraction of all that the source emits which lands on the picture; of log-rms as on_screen",
     "front": "whether the lens is on the Pareto front: none other is both brighter and has a smaller error",
     "seconds": "of the design's iterations",
 }
@@ -49,7 +50,8 @@ COLUMNS = {
 @dataclass(frozen=True, eq=False)
 class DesignedLens:
     """A designed lens: its thickness, mm, the weight of the light, the loss, the scene, the spline spaces and heights (n, m) mm,
-    the target (n_x, n_y), and the seconds its iterations took."""
+    the target (n_x, n_y), and the seconds its iterations took; of a shaped laser beam the wanted efficiency in place of the weight,
+    and figures by its wave image, as of `beam.beam_figures`."""
 
     thickness: float
     weight: float
@@ -59,6 +61,7 @@ class DesignedLens:
     heights: Tensor
     target: np.ndarray
     seconds: float
+    shaped: dict[str, float] | None = None
 
 
 def run_efficiency(
@@ -84,7 +87,11 @@ def run_efficiency(
     for k, lens in enumerate(lenses):
         usual = min(current_effort().final_rays, RAYS_PER_PIXEL * lens.target.size)
         traced = checks.whole("⟨rays⟩", usual if rays is None else rays, 256, 1 << 32)
-        _, figures = retrace(lens.scene, lens.field, lens.heights, lens.target, rays=traced, seed=seed, device=device)
+        if lens.shaped is None:
+            _, figures = retrace(lens.scene, lens.field, lens.heights, lens.target, rays=traced, seed=seed, device=device)
+        else:
+            part = lens.shaped["in_region"]
+            figures = {"relative_rms": lens.shaped["error"], "noise": 0.0, "on_screen": part, "of_source": part}
         rows.append(
             {
                 "series": f"{lens.thickness:g} mm",

@@ -331,6 +331,8 @@ def files(path: Path, scene: Scene, format: str, script: bool = False) -> list[P
     """All files of an export, the lens first."""
     if format == "heightmap":
         return [path, beside(path)]
+    if format == "phase":
+        return [path, *_home(format).companions(path)]
     if format == "mitsuba":
         return [path, *_home(format).companions(path, scene)]
     return [path, *import_module("caustic_cli.export.lighttools_script").companions(path)] if script else [path]

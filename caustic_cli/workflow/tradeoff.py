@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import cast
 
 from caustic_cli.config import settings
+from caustic_cli.config.design import region_of
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.io.picture import Picture
 from caustic_cli.kinds import problem_of
+from caustic_cli.optics.region import Region
+from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
+from caustic_cli.studies.beam import beam_figures
 from caustic_cli.studies.efficiency import DesignedLens
 from caustic_cli.workflow.comparison import picture_of_disc
 from caustic_cli.workflow.design import PreparedDesign, first_heights
 
 #: Weights of the loss "light" relative to "rms", for distant sources, where thickness has no influence, and for near sources.
 DISTANT_WEIGHTS, NEAR_WEIGHTS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0), (0.0, 1.0, 10.0)
+#: Efficiencies of laser beams, from the highest down.
+BEAM = (0.99, 0.985, 0.97, 0.95, 0.9)
 #: Thicknesses for near sources, relative to that of the scene.
 PARTS = (0.7, 1.0, 1.4, 2.0)
 #: Default scene: width of an LED and its distance, mm, at which much of its light is lost; cone, degrees; pixels across the screen.
@@ -41,6 +48,8 @@ def lenses(project: Project | None, seconds: float, device: str) -> tuple[int, I
     """Largest number of lenses, and an iterator that designs them, each with at most `seconds` of iterations; those whose light
     cannot reach the picture are left out."""
     full = led() if project is None else project.settings
+    if project is not None and region_of(full.design) is not None:
+        return len(BEAM), _shaped(project, seconds, device)
     near = not settings.build_source(full.source).distant and not full.lens.mirror
     weights, fractions = (NEAR_WEIGHTS, PARTS) if near else (DISTANT_WEIGHTS, (1.0,))
     return len(weights) * len(fractions), _designed(project, full, weights, fractions, seconds, device)
@@ -74,6 +83,26 @@ def _designed(project: Project | None, full: Settings, weights, fractions, secon
                 problem.target.numpy(),
                 state.seconds,
             )
+
+
+def _shaped(project: Project, seconds: float, device: str) -> Iterator[DesignedLens]:
+    """Lenses that shape a laser beam, with the loss and the stages of the project, for each efficiency."""
+    prepared = _prepared(project, project.settings, device)
+    problem = prepared.problem
+    assert problem is not None
+    for goal in BEAM:
+        region = replace(cast(Region, problem.stages[-1].rendering.bright), goal=goal)
+        stages = [replace(stage, rendering=replace(stage.rendering, bright=region)) for stage in problem.stages]
+        try:
+            designer = Designer(problem.varied(stages, problem.options))
+            state = designer.run(designer.initial_state(*prepared.first or ()), time_limit=seconds)
+            field, heights = designer.field(state.stage), designer.within_limits(state)
+            found = wave_image(problem.scene, field, heights)
+        except CausticError:
+            continue
+        figures = beam_figures(found.image, found.leaving, region.on(problem.target), problem.scene.screen.pixel)
+        how = problem.scene, field, heights, problem.target.numpy(), state.seconds, figures
+        yield DesignedLens(problem.scene.lens.offset.thickness, goal, problem.options.loss, *how)
 
 
 def _prepared(project: Project | None, varied: Settings, device: str) -> PreparedDesign:

@@ -1,4 +1,4 @@
-"""The gallery: thirteen lenses of different kinds, designed by whole commands, with their pictures, times and figures.
+"""The gallery: fourteen lenses of different kinds, designed by whole commands, with their pictures, times and figures.
 
     python tests/benchmarks/gallery.py [--only NAME,...] [--quality draft|standard|fine] [-o DIR]
 
@@ -39,6 +39,12 @@ LENSES = {
     "sundial": ("A sundial in a roof window: nine lenslets, nine hours", "dial", "--preset sundial --quality draft"),
     "led": ("A luminaire lens, 60 mm from an LED, wall at 2 m", "tophat", "--preset led-30"),
     "laser": ("A round lens in a laser beam, screen at 1 m", "flame", "--preset laser-25"),
+    "beam": (
+        "The beam of a laser as an even disc of 6 mm, with 0.97 of the light in it",
+        "tophat",
+        "--source gaussian --waist 3 --wavelengths 1064 --lens-size 12 --throw 500 --picture-size 13x13 --margin 0"
+        " --loss log-rms --efficiency 0.97",
+    ),
     "print": ("A lens of printing resin, 500 mm from a small LED, wall at 300 mm", "portrait", "--preset print-50"),
 }
 HEAD = """# Gallery

@@ -11,7 +11,7 @@ import torch
 from fields import Given, disc, mean_around, mean_over, middles, slit
 from scipy.special import airy, j0, j1, jv
 
-from caustic_cli.optics.waves.propagation import cells, pixel_edges, power_by_blocks, power_on_pixels
+from caustic_cli.optics.waves.propagation import Exposure, PrunedExposure, cells, pixel_edges, power_by_blocks, power_on_pixels
 from caustic_cli.optics.waves.sampling import Sampling
 
 LAMBDA = 5.5e-4
@@ -301,3 +301,29 @@ def test_single_precision_derivative():
         found.append((phase.grad.double(), amplitude.grad.double()))
     for a, b in zip(*found, strict=True):
         assert float((a - b).norm() / b.norm()) < 1e-5
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_part_of_the_pixels_by_matrix_products(keep):
+    """The power on these pixels, by samples that are much finer, and its derivative."""
+    torch.manual_seed(0)
+    phase, amplitude, change = (torch.rand(30, 24, dtype=torch.float64) for _ in range(3))
+    fine = 16
+    edges = torch.linspace(3.3, 60.1, 21, dtype=torch.float64), torch.linspace(0.2, 79.3, 17, dtype=torch.float64)
+    # Sample j of N is sample fine j of fine N, between edges that are (fine - 1) / 2 fine samples farther on.
+    finer = tuple(fine * (e - 0.5) + 0.5 for e in edges)
+    part, inside = PrunedExposure(6.0 * phase, amplitude, 3.0, (64, 80), edges, ((4, 15), (1, 9))), (slice(4, 15), slice(1, 9))
+    whole = Exposure(6.0 * phase, amplitude, 3.0, (64 * fine, 80 * fine), finer)
+    image = part.image(change, keep)
+    assert torch.equal(image.nonzero().amin(0), torch.tensor([4, 1])) and torch.equal(
+        image.nonzero().amax(0), torch.tensor([14, 8])
+    )
+    assert torch.allclose(image[inside], whole.image(change)[inside], rtol=1e-3, atol=1e-3 * float(image.max()))
+    by_pixel, found, expected = torch.zeros(20, 16, dtype=torch.float64), torch.zeros_like(phase), torch.zeros_like(phase)
+    by_pixel[inside] = torch.rand(11, 8, dtype=torch.float64)
+    part.pull(by_pixel, change, found)
+    whole.pull(by_pixel, change, expected)
+    assert torch.allclose(found, expected, atol=3e-3 * float(expected.abs().max()))
+    step = 1e-6 * torch.rand_like(change)
+    ahead, behind = (float((part.image(change + s) * by_pixel).sum()) for s in (step, -step))
+    assert (ahead - behind) / 2.0 == pytest.approx(float((found * step).sum()), rel=1e-6)

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from caustic_cli.optics.emission.base import Illuminated, intensity_of
 from caustic_cli.optics.emission.brightness import points_by_brightness
-from caustic_cli.optics.emission.parallel import mean_irradiance
 from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
@@ -52,6 +51,10 @@ class Mode:
             return replace(state, power=self._even(u, v))
         (rx, ry), (px, py, pz) = pupil.half_size, self.position
         x, y = (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
+        if source.beam:
+            found = source.beam(x, y, pupil, *offset(source, self.position))
+            power = self.part / pupil.aperture.area * found.irradiance / source.passed(pupil)
+            return RayState((x, y, pupil.z), found.directions, power, path=index * found.path)
         if source.distant:
             return RayState(
                 (x, y, pupil.z),
@@ -73,14 +76,12 @@ class Mode:
         return RayState((x, y, pupil.z), (dx / r, dy / r, cosine), power, path=index * r)
 
     def _even(self, u: Tensor, v: Tensor) -> Tensor:
-        """Density of light from infinity on the pupil, 1/mm^2, with the profile if there is one."""
-        pupil, profile = self.scene.pupil, self.scene.source.profile
-        area = pupil.aperture.area
-        if profile is None:
-            return torch.full_like(u, self.part / area)
-        table = torch.as_tensor(np.asarray(profile), dtype=torch.float64, device=u.device)
-        a, b = ((c * n).long().clamp(0, n - 1) for c, n in zip((u, v), table.shape, strict=True))
-        return self.part / area * table[a, b] / mean_irradiance(np.asarray(profile), pupil.aperture)
+        """Density of light from infinity on the pupil, 1/mm^2, with its irradiance if that is uneven."""
+        source, pupil = self.scene.source, self.scene.pupil
+        part, (rx, ry) = self.part / pupil.aperture.area, pupil.half_size
+        if not source.uneven:
+            return torch.full_like(u, part)
+        return part * source.irradiance((2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry, pupil) / source.passed(pupil)
 
 
 def central_mode(scene: Illuminated) -> Mode:

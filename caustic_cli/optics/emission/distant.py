@@ -1,5 +1,5 @@
 """Sampling of a disc at infinity, such as the sun: uniform over the aperture, and by its radiance over solid angle projected
-onto the aperture.
+onto the aperture; and of a laser beam.
 
 Notation, for a direction at the angle theta to the disc's axis d, in the frame that is d's by the rotation of `turned_about`
     s           its sines, |s| = sin theta
@@ -13,7 +13,9 @@ disc, and the azimuth has the density 1 - e cos phi: its distribution function i
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -23,12 +25,15 @@ from caustic_cli.optics.emission.base import Emission
 from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.sampling import numbers
 from caustic_cli.scene import Source
 
 #: Newton iterations for Kepler's equation, and their tolerance, rad.
 STEPS, FOUND = 60, 1e-14
 #: Least number of parts of a picture along each axis of which W is constant.
 FINE = 256
+#: Rays of a beam at a time for their whole power.
+BATCH = 1 << 20
 
 
 class Distant(Emission):
@@ -81,4 +86,38 @@ def _received(source: Source) -> np.ndarray:
         return np.where(within > 0, light * np.maximum(1.0 - (x * dx + y * dy) / (z * np.sqrt(within)), 0.0), 0.0)
 
 
-EMISSIONS = {"far disc": Distant.of_size}
+class BeamRays(Emission):
+    """Rays along the normals of the wavefronts of a beam (`gaussian`), weighted by its irradiance; where it is partly coherent,
+    each belongs to one of the beams that it consists of."""
+
+    dimensions: ClassVar[int] = 4
+
+    def _drawn(self, start: int, *draws: Tensor) -> RayState:
+        x, y, found = self._found(*draws)
+        power = found.irradiance / self._whole
+        return self._at_pupil(x, y, found.directions, power, float(power.sum()))
+
+    def _found(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Any]:
+        """Points of the pupil, mm, and the beam there."""
+        source, pupil = self.scene.source, self.scene.pupil
+        x, y = pupil.aperture.spread(u, v)
+        tilt: tuple = (0.0, 0.0)
+        if source.brightness is not None:
+            tilt = tuple(f * c for f, c in zip(source.frame, points_by_brightness(source.brightness, a, b), strict=True))
+        assert source.beam is not None
+        found = source.beam(x, y, pupil, *tilt)
+        directions = tuple(d if isinstance(d, Tensor) else torch.full_like(x, d) for d in found.directions)
+        return x, y, found._replace(directions=directions)
+
+    def _irradiances(self) -> Iterator[Tensor]:
+        for start in range(0, self.count, BATCH):
+            stop = min(start + BATCH, self.count)
+            yield self._found(*numbers(self.kind, self.shape, self.seed, self.dimensions, start, stop, self.device))[2].irradiance
+
+    @cached_property
+    def _whole(self) -> float:
+        """Sum of the irradiances of all rays."""
+        return sum(float(some.sum()) for some in self._irradiances())
+
+
+EMISSIONS = {"far disc": Distant.of_size, "gaussian": BeamRays.of_size}

@@ -10,38 +10,28 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
 import torch
+from torch import Tensor
 
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.emission.base import Emission, Illuminated
 from caustic_cli.optics.pencil import Bundle
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample, Sampler
-from caustic_cli.scene import Aperture
 
 beam = OnDemand("caustic_cli.optics.beam")
-
-#: Points along each axis for the mean of a profile over a round aperture.
-ROUND = 1000
 
 
 def parallel(scene: Illuminated, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Sampler:
     """A sampler of about `rays` rays parallel to +z over the aperture, weighted by the source's profile if it has one."""
-    profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
-    (rx, ry), aperture = scene.pupil.half_size, scene.pupil.aperture
-    return Sampler.of_size(kind, rays, rx / ry, seed=seed, profile=profile, device=device, aperture=aperture)
+    source, pupil = scene.source, scene.pupil
+    (rx, ry), aperture = pupil.half_size, pupil.aperture
 
+    def profile(u: Tensor, v: Tensor) -> Tensor:
+        return source.irradiance((2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry, pupil)
 
-def mean_irradiance(profile: np.ndarray, aperture: Aperture) -> float:
-    """Mean of a relative irradiance over an aperture, whose half widths are those of the profile (a, b), by ROUND points along each
-    axis of a round one."""
-    if not aperture.round:
-        return float(profile.mean())
-    at = (np.arange(ROUND) + 0.5) / ROUND
-    inside = aperture.covers(2.0 * at[:, None] - 1.0, 2.0 * at[None, :] - 1.0)
-    i, j = ((at * n).astype(int) for n in profile.shape)
-    return float(profile[i[:, None], j[None, :]][inside].mean())
+    irradiance = profile if source.uneven else None
+    return Sampler.of_size(kind, rays, rx / ry, seed=seed, profile=irradiance, device=device, aperture=aperture)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +56,7 @@ class TiltedPlane(Emission):
     @property
     def homocentric(self) -> bool:
         """Whether its rays can be had as `pencils`, with their vertex at infinity: where a profile does not weight them."""
-        return self.scene.source.profile is None
+        return not self.scene.source.uneven
 
     def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
         """The rays in `chunks`, as beams: through as many points of the exit."""

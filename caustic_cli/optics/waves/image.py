@@ -48,6 +48,9 @@ NM = 1e-6
 A_SECOND, UNASKED = 1e8, 120e8
 #: Most samples of a transform that is computed whole, with about 50 bytes each; others are by blocks.
 WHOLE = 1 << 24
+#: Least number of samples of the field per knot span of the finest surface: its finest structure sends light aside, which would
+#: otherwise be aliased into the picture.
+SAMPLES_A_SPAN = 2
 #: Traced nodes per knot span of the finest surface, and their least number along an axis.
 A_SPAN, LEAST_NODES = 3, 384
 #: Largest margin of the computed region on each side of the screen, relative to the screen's width.
@@ -326,9 +329,12 @@ class Imager:
             tuple(min(s.light[0][k] for s in surveys) for k in (0, 1)),
             tuple(max(s.light[1][k] for s in surveys) for k in (0, 1)),
         )
-        sampling = Sampling.of(light, _region(receiver, surveys, watched, spread, blur), receiver.pixel, distance, lengths, finer)
-        spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
-        nodes, enough = sampling.count, max(LEAST_NODES, A_SPAN * max(spans, default=0))
+        spans = [[len(s.breaks) - 1 for s in e.surface.spaces] for e in system.elements if isinstance(e.surface, HeightField)]
+        finest = [max((s[k] for s in spans), default=0) for k in (0, 1)]
+        resolved = SAMPLES_A_SPAN * finest[0], SAMPLES_A_SPAN * finest[1]
+        region = _region(receiver, surveys, watched, spread, blur)
+        sampling = Sampling.of(light, region, receiver.pixel, distance, lengths, finer, resolved)
+        nodes, enough = sampling.count, max(LEAST_NODES, A_SPAN * max(finest))
         if not dense:
             nodes = min(nodes[0], enough), min(nodes[1], enough)
         return cls(system.source, receiver, surveys[0], sampling, spread, nodes, each, exact, watched is None)

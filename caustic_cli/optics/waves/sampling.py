@@ -60,6 +60,7 @@ class Sampling:
         distance: float,
         wavelengths: tuple[float, ...],
         finer: float = 1.0,
+        least: tuple[int, int] = (1, 1),
     ) -> Sampling:
         """Sufficient sampling for all wavelengths.
 
@@ -69,6 +70,7 @@ class Sampling:
             pixel: widths, mm.
             wavelengths: in the image space, mm.
             finer: oversampling factor along each axis of both planes.
+            least: numbers of samples across the light, before oversampling.
 
         Raises:
             NoWaveImage: more than MOST samples are needed.
@@ -78,7 +80,7 @@ class Sampling:
         for k in (0, 1):
             width = light[1][k] - light[0][k]
             seen = BEYOND * max(landing[1][k] - landing[0][k], 1e-12)
-            n = max(LEAST, math.ceil(finer * width * seen / (short * distance)))
+            n = max(LEAST, math.ceil(finer * least[k]), math.ceil(finer * width * seen / (short * distance)))
             most = max(FINER * n * finer, A_PIXEL * finer * long * distance * n / (width * pixel[k]))
             if most > MOST:
                 raise NoWaveImage(

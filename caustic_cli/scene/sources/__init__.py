@@ -70,7 +70,7 @@ CALLED = {
     "sun": f"sunlight is ⟨source⟩ disc with ⟨+source.angle⟩ {SUN:g}",
     "led": "an LED is ⟨source⟩ disc with ⟨+source.size⟩ 1x1, ⟨+source.position⟩ 0,0,-50 and ⟨+source.intensity⟩ lambertian",
     "lambertian": "that is an ⟨+source.intensity⟩, of ⟨source⟩ point, grid or disc",
-    "laser": "a laser's parallel beam is ⟨source⟩ plane",
+    "laser": "a laser's beam is ⟨source⟩ gaussian with ⟨+source.waist⟩ and ⟨+source.wavelengths⟩, or plane where it is even",
     "lamp": "a lamp is ⟨source⟩ disc with ⟨+source.size⟩ and ⟨+source.position⟩",
 }
 

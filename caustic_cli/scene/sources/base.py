@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,18 @@ if TYPE_CHECKING:
 
 #: Relative margin of a cone that just covers the aperture, so that rounding leaves no corner dark.
 SLACK = 1e-9
+#: Points along each axis for the mean of a profile over a round aperture.
+POINTS = 1000
+
+
+def looked_up(profile: np.ndarray, u, v) -> Any:
+    """Values of a picture (a, b), constant on each cell, at points of [-1, 1]^2, arrays of NumPy or of torch that can be
+    broadcast."""
+    numpy = isinstance(u, np.ndarray)
+    table = profile if numpy else u.new_tensor(profile)
+    i, j = (0.5 * (c + 1.0) * n for c, n in zip((u, v), profile.shape, strict=True))
+    i, j = (c.astype(int) if numpy else c.long() for c in (i, j))
+    return table[i.clip(0, profile.shape[0] - 1), j.clip(0, profile.shape[1] - 1)]
 
 
 class Source:
@@ -39,7 +51,8 @@ class Source:
     unit vector, the direction of light from infinity, or the axis of the cone of a near source and of its intensity, +z except
     where errors of alignment tilt it; collimated: see the module; rays: ray set of a file, None for a source that is sampled;
     brightness: relative radiance over `frame`, (a, b) [i, j], or None if uniform over an ellipse; spectra: of several sources,
-    wavelengths, nm, and relative powers of each; measures: and the continuous spectrum that these are samples of, or None.
+    wavelengths, nm, and relative powers of each; measures: and the continuous spectrum that these are samples of, or None; beam:
+    its field on the pupil where that is no plane wave's, as of `gaussian.Gaussian.beam`.
     """
 
     kind: str
@@ -53,6 +66,7 @@ class Source:
     brightness: np.ndarray | None = None
     spectra: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
     measures: tuple[Measure | None, ...] = ()
+    beam: Callable[..., Any] | None = None
 
     if TYPE_CHECKING:  # values of some types and properties of others: all that can be said of any is that they are read
 
@@ -63,6 +77,26 @@ class Source:
         def collimated(self) -> bool: ...
     else:
         collimated = False
+
+    @property
+    def uneven(self) -> bool:
+        """Whether a distant source lights the aperture unevenly, see `irradiance`."""
+        return self.profile is not None
+
+    def irradiance(self, x, y, pupil: Pupil) -> Any:
+        """Relative irradiance of an uneven distant source at points of the pupil's plane, mm, arrays of NumPy or of torch that can
+        be broadcast."""
+        assert self.profile is not None
+        return looked_up(self.profile, x / pupil.half_size[0], y / pupil.half_size[1])
+
+    def passed(self, pupil: Pupil) -> float:
+        """Power of an uneven distant source through the pupil over the pupil's area, in the unit of `irradiance`."""
+        assert self.profile is not None
+        if not pupil.aperture.round:
+            return float(self.profile.mean())
+        line = (2.0 * np.arange(POINTS) + 1.0) / POINTS - 1.0
+        u, v = np.meshgrid(line, line, indexing="ij")
+        return float(looked_up(self.profile, u, v)[pupil.aperture.covers(u, v)].mean())
 
     @property
     def members(self) -> tuple[Source, ...]:

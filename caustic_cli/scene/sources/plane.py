@@ -10,7 +10,7 @@ import numpy as np
 from caustic_cli.errors import InputError
 from caustic_cli.scene.screen import tilted
 from caustic_cli.scene.sources.base import Source
-from caustic_cli.scene.sources.section import SourceType, Table
+from caustic_cli.scene.sources.section import SourceType, Table, content
 from caustic_cli.schema.table import check, default
 
 
@@ -79,7 +79,10 @@ def direction(tilt: tuple[float, float], half_angle: float = 0.0) -> tuple[float
 
 
 def _plane(table: Table, profile: np.ndarray | None) -> PlaneWave:
-    return PlaneWave(table["power"], profile, tuple(table.get("tilt") or default("source.tilt")))
+    light = content(table, "file", np.ndarray)
+    if light is None and table.get("file"):
+        raise InputError("⟨source.file⟩ of a plane wave must be a picture of its irradiance, an image or a 2-D .npy")
+    return PlaneWave(table["power"], light if profile is None else profile, tuple(table.get("tilt") or default("source.tilt")))
 
 
-TYPES = (SourceType("plane", "plane (as wide as the lens)", ("profile", "tilt"), _plane),)
+TYPES = (SourceType("plane", "plane (as wide as the lens)", ("profile", "file", "tilt"), _plane),)
