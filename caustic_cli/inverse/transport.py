@@ -16,6 +16,9 @@ modifications make full Newton steps robust from a poor initial guess:
     a site with an empty cell gets the price at which its plane touches phi, and a border with the site it touches as
     long as that of a round cell of its mass.
 
+Where the source is dark outside a convex region, cells end at its edge (`_lit_part`).  Dark cells within are lit by a fraction
+`darkest` of the mean, since a cell without light has no derivative.
+
 The final phi is averaged over a few source cells, which keeps it convex and the map its exact gradient.
 
 Between separate bright regions phi has a kink, which that average smooths: light that crosses it falls into the dark gap.  So kinks
