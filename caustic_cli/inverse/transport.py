@@ -16,6 +16,9 @@ modifications make full Newton steps robust from a poor initial guess:
     a site with an empty cell gets the price at which its plane touches phi, and a border with the site it touches as
     long as that of a round cell of its mass.
 
+Where the source is dark outside a convex region, cells end at its edge (`_lit_part`).  Dark cells within are lit by a fraction
+`darkest` of the mean, since a cell without light has no derivative.
+
 The final phi is averaged over a few source cells, which keeps it convex and the map its exact gradient.
 
 Between separate bright regions phi has a kink, which that average smooths: light that crosses it falls into the dark gap.  So kinks
@@ -59,8 +62,8 @@ COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
 EVENER = (1.0, 0.7, 0.4, 0.2, 0.1, 0.03, 0.0)  # continuation in the fraction of uniform light, if a level fails otherwise
 DARKEST = 1e-3  # lower bound of the source over its mean: a cell without light has no derivative
 MAX_CELLS = 4096
-#: No sides of a source (`laguerre.cells`), part of the rectangle above which none are needed, and those of qhull's equations.
-WHOLE, NEARLY_ALL, OUTWARD = np.zeros((0, 3)), 0.99, (1.0, 1.0, -1.0)
+#: No sides of a source (`laguerre.cells`), and the signs of qhull's equations in them.
+WHOLE, OUTWARD = np.zeros((0, 3)), (1.0, 1.0, -1.0)
 #: Width of the average of phi in `finer`, in its cells, which are smaller than the Laguerre cells.
 SHARP = 0.75
 STRIP = 128  # columns of corners averaged together, which bounds the memory
@@ -371,14 +374,15 @@ def _inside(raster: list, sides: np.ndarray) -> np.ndarray | None:
 
 def _lit_part(f: np.ndarray, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
     """A source (n, m) that is dark outside a convex region, continued evenly beyond it, and the region's sides, as of
-    `laguerre.cells`: a polygon through the cells that are half covered, widened to the area of their light.  Of one that fills most
-    of its rectangle no sides, and the source as it is."""
+    `laguerre.cells`: a polygon through the cells that are half covered, widened to the area of their light.  Of any other no sides,
+    and the source as it is."""
     lines = [_to_edges(centres(n, h), h) for n, h in zip(f.shape, (a, b), strict=True)]
     places = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
-    hull = _hull(places[f > 0])
-    if hull is None or hull.volume > NEARLY_ALL * 4.0 * a * b:
+    hull = None if f.all() else _hull(places[f > 0])
+    outside = np.zeros(f.shape, bool) if hull is None else (f <= 0) & ~_inside(lines, hull.equations * OUTWARD)
+    if not outside.any():
         return f, WHOLE
-    edge = ndimage.binary_dilation((f <= 0) & ~_inside(lines, hull.equations * OUTWARD), np.ones((3, 3), bool))
+    edge = ndimage.binary_dilation(outside, np.ones((3, 3), bool))
     nearest = ndimage.distance_transform_edt(edge, return_distances=False, return_indices=True)
     even = f[tuple(nearest)]
     hull = None if edge.all() or not even.min() > 0 else _hull(places[(f > 0) & (f >= 0.5 * even)])
