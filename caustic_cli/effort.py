@@ -109,7 +109,7 @@ class Effort:
     two_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 30_000, 120, 0.1),
         (6_000, 60_000, 80, 0.03),
-        (24_000, 250_000, 80, 0.015),
+        (24_000, 250_000, 110, 0.015),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.
     chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_000, 400_000, 70, 0.035),)
