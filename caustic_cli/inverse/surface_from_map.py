@@ -241,8 +241,9 @@ def heights(
     towards = None if projection is None else projection.directions_to(*aim)
     within, rest, moved = np.empty(z.shape, bool), np.empty((2, *z.shape)), 0.0
     for _ in range(REPEATS):
-        for rows in _strips(len(z), len(z) if projection else ROWS):
-            to = towards(x, y, z) if towards else (aim[0][rows] - x[rows], aim[1][rows] - y, z_screen - z[rows])
+        ahead = towards(x, y, z) if towards else None
+        for rows in _strips(len(z), ROWS):
+            to = tuple(c[rows] for c in ahead) if ahead else (aim[0][rows] - x[rows], aim[1][rows] - y, z_screen - z[rows])
             light = tuple(v[rows] if isinstance(v, np.ndarray) else v for v in d)
             within[rows] = turned = refracted(*to, light, index)
             for w, s, out in zip(slopes_to(*to, light, index), slope, rest, strict=True):

@@ -51,7 +51,7 @@ FINE = 4  # raster points per source cell along each axis, over which phi is ave
 SEEN, MANY = 8, 4096  # FINE at least; beyond that, at most so many points along an axis
 #: Transport error at which sites whose cells the raster misses are merged with neighbours, for convergence; most repetitions.
 MERGED, ROUNDS = 5e-3, 4
-STRICTER = 0.1  # tolerance of scattered sites in that of others: what is left is the light of a few, at the edge of the source
+STRICTER = 0.2  # tolerance of scattered sites in that of others: what is left is the light of a few, at the edge of the source
 COVERED = 0.99  # part of the scattered sites that move by no more than the map is widened for its first prices
 LEAST = 128  # raster points along an axis
 LEVELS = (64, 16, 4, 1)  # ratios of the number of sites on the finest level to that on each level
@@ -392,7 +392,8 @@ def _lit_part(f: np.ndarray, a: float, b: float) -> tuple[np.ndarray, np.ndarray
     ends = hull.points[hull.simplices]
     fixed = ((ends == (a, b)).all(1) | (ends == (-a, -b)).all(1)).any(1)  # along the edges of the rectangle
     sides, lengths = (hull.equations * OUTWARD)[~fixed], np.hypot(*(ends[:, 0] - ends[:, 1]).T)[~fixed]
-    return even, sides + (0.0, 0.0, (area - hull.volume) / lengths.sum())
+    sides[:, 2] += (area - hull.volume) / lengths.sum()
+    return even, sides
 
 
 def _hull(points: np.ndarray) -> ConvexHull | None:
