@@ -4,7 +4,9 @@ refracting surface, and compared with what the export says of itself."""
 from __future__ import annotations
 
 import json
+import zipfile
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -136,6 +138,10 @@ def read_back(path, format, field, seed):
         points = np.unique(read_stl(path)["corners"].reshape(-1, 3).astype(float), axis=0)
     elif format == "ply":
         points = read_ply(path)
+    elif format == "3mf":
+        with zipfile.ZipFile(path) as archive:
+            model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
+        points = np.array([[float(vertex.get(c)) for c in "xyz"] for vertex in model.iter() if vertex.tag.endswith("}vertex")])
     else:
         points = np.array([line.split()[1:] for line in path.read_text().splitlines() if line.startswith("v ")], float)
     return bicubic(*grid_of(points[points[:, 2] > 0]), seed)

@@ -38,6 +38,7 @@ bright_parts = OnDemand("caustic_cli.optics.region")
 
 #: e_0, an error too small to matter; w and m of log-rms.
 LEAST, WEIGHT, BEYOND = 1e-4, 1e6, 3e-4
+IN_THE_DARK = "no light reaches the bright part of the picture"
 
 
 class NoLight(CausticError):
@@ -120,15 +121,15 @@ class Loss:
         if name == "light":
             return 1.0 - (image * (1.0 - self.distance / max(self.apron, 1))).sum() / entering
         if name == "log-rms":
+            if not float(image.detach()[self.bright.mask].sum()) > 0:
+                raise NoLight(f"{IN_THE_DARK}, so its relative error is undefined; check throw, mag and screen size")
             error, part = self.bright.error(image), self.bright.efficiency(image) / leaving
             short = (self.bright.goal + BEYOND - part).clamp_min(0.0)
             return torch.log1p((error / LEAST) ** 2) + WEIGHT * short * short
         if name == "uniformity":
             inside = image[self.region]
             if not float(inside.detach().sum()) > 0:  # a black region would count as uniform
-                raise NoLight(
-                    "no light reaches the bright part of the picture, so uniformity is undefined; check throw, mag and screen size"
-                )
+                raise NoLight(f"{IN_THE_DARK}, so uniformity is undefined; check throw, mag and screen size")
             return (inside / inside.mean()).var(correction=0)
         residual = image / (total if name == "rms" else leaving) - self.target
         if self.blur is not None:

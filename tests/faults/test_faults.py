@@ -69,7 +69,7 @@ FULL = """
 import json, resource, sys
 from caustic_cli import cli
 from caustic_cli.workflow import design as workflow
-resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))  # writing beyond fails as on a full disk
+resource.setrlimit(resource.RLIMIT_FSIZE, (9500, 9500))  # writing beyond fails as on a full disk
 for arguments in json.load(sys.stdin):
     print(cli.run(arguments), flush=True)
 """
@@ -77,7 +77,7 @@ for arguments in json.load(sys.stdin):
 
 def test_a_full_disk_ends_in_1_with_what_was_there_before(capfd):
     run(DESIGN, capfd, 0)
-    assert Path("blob.caustic/checkpoints.h5").stat().st_size > 9000 > Path("blob.caustic/project.toml").stat().st_size
+    assert Path("blob.caustic/checkpoints.h5").stat().st_size > 9500 > Path("blob.caustic/project.toml").stat().st_size
     before = content("blob.caustic")
     orders = [
         ["design", "--resume", "blob.caustic", "--iterations", "5", "--quiet"],
