@@ -25,6 +25,7 @@ SMALL = {
     for name, value in {
         "DESIGN_RESOLUTION": "24",
         "DESIGN_ITERATIONS": "2",
+        "DESIGN_CONTROL": "40",
         "DESIGN_LENS_SIZE": "6",
         "DESIGN_THROW": "180",
         "DESIGN_WAVES": "off",
@@ -38,7 +39,7 @@ SMALL = {
         "CONVERGENCE_FORCE": "1",
     }.items()
 }
-OF_HEIGHT_FIELDS = [f"CAUSTIC_DESIGN_{name}" for name in ("RESOLUTION", "ITERATIONS", "LENS_SIZE", "THROW", "WAVES")]
+OF_HEIGHT_FIELDS = [f"CAUSTIC_DESIGN_{name}" for name in ("RESOLUTION", "ITERATIONS", "CONTROL", "LENS_SIZE", "THROW", "WAVES")]
 #: Lines that need what no chapter makes, and studies of minutes, which tests of their own run smaller.
 NEEDS_MORE = ("--verify", "--source-file led.tm25ray", "--study diffraction", "led.caustic --study light", "--explain")
 NEEDS_MORE += ("--tolerances", "--robust", "--day", "blank.caustic")
@@ -98,6 +99,8 @@ def test_the_commands_of_a_chapter_run(chapter, home, monkeypatch, capfd):
         where = few.index("2>") if "2>" in few else len(few)
         if "--screen" in few or "window-floor" in few or "sundial" in few:  # which say where the screen is
             monkeypatch.delenv("CAUSTIC_DESIGN_THROW")
+        if "--config" in few or "--array" in few:  # which say how many control points there are, or for how many lenslets
+            monkeypatch.delenv("CAUSTIC_DESIGN_CONTROL")
         if "--lamp" in few or {"street", "spot", "headlamp"} & {*few}:  # which have no settings of a height field
             for name in OF_HEIGHT_FIELDS:
                 monkeypatch.delenv(name)
