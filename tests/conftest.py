@@ -80,13 +80,35 @@ def pytest_sessionstart(session):
         ahead.compile_behind(ahead.PARTS)
 
 
-def pytest_collection_modifyitems(items):
+#: Tests of ten to forty seconds each, together two and a half minutes on two cores, that run with --long: of what seldom changes or
+#: is tested elsewhere in smaller pieces.
+LONG = (
+    "faults/test_kill.py",
+    "test_a_design_killed_before_its_first_checkpoint_is_begun_anew[index]",
+    "test_kernels_in_the_simulator",
+    "test_kernels_through_the_compiler",
+    "test_a_flat_mirror_excludes_nothing_that_a_lens_has_by_itself",
+    "test_surfaces_of_two_lenses_are_shaped_together",
+    "test_the_commands_of_a_chapter_run[5-accuracy]",
+    "test_the_commands_of_a_chapter_run[6-thesis]",
+    "test_the_commands_of_a_chapter_run[13-other-elements]",
+    "test_the_python_of_a_chapter_runs[7-library]",
+    "test_a_designed_lens_obeys_its_limits",
+    "test_files_of_one_index_have_that_of_the_one_wavelength",
+    "test_an_addition_touches_few_files",
+)
+
+
+def pytest_collection_modifyitems(config, items):
     for item in items:
+        if not config.getoption("--long") and any(name in item.nodeid for name in LONG):
+            item.add_marker(pytest.mark.skip(reason="takes long: --long"))
         if not {*SLOW}.isdisjoint(item.path.relative_to(Path(__file__).parent).parts):
             item.add_marker(pytest.mark.slow)
 
 
 def pytest_addoption(parser):
+    parser.addoption("--long", action="store_true", help="run the tests of ten to forty seconds, too")
     parser.addoption("--hard-cases", action="store_true", help="print what the tests of tests/stability measured, as Markdown")
 
 
