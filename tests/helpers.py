@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 from PIL import Image
 
+from caustic_cli.scene.sources.base import looked_up
+
 
 def write_blob(name: str = "blob.png", size: int = 24, centre: tuple[float, float] = (8, 9), width: float = 30.0) -> None:
     """A grey picture with a smooth bright spot: `size` x `size` 8-bit codes, 40 to 240; centre: column and row."""
@@ -41,3 +43,8 @@ def pairwise(*lists: Sequence) -> list[tuple]:
         missing -= {*combinations(sorted(row.items()), 2)}
         rows.append(tuple(one[row[k]] for k, one in enumerate(lists)))
     return rows
+
+
+def looked_up_in(profile):
+    """A profile (a, b), constant per cell, as the function of u and v that a sampler takes."""
+    return lambda u, v: looked_up(profile.numpy(), 2.0 * u - 1.0, 2.0 * v - 1.0)

@@ -39,6 +39,7 @@ from caustic_cli.scene import (
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.screen import Sags
 from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.gaussian import Gaussian
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
@@ -105,6 +106,7 @@ SCENES: dict[str, Scene] = {
     "ray file": of(FILE),
     "ray file among sources": of(Several((PlaneWave(), FILE), (NONE, NONE))),
     "user-defined source": of(Ring((AT,), kind="ring")),
+    "laser beam": of(Gaussian((1.0, 1.0), 633.0)),
     "near source": of(Points((AT,))),
     "tilted light": of(PlaneWave(tilt=(20.0, 0.0))),
     "light not parallel": of(Disc(angle=0.5)),

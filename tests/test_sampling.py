@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from helpers import looked_up_in
 from scipy import stats
 
 from caustic_cli.errors import InputError
@@ -76,8 +77,7 @@ def test_lines_are_a_tensor_grid(kind):
 @pytest.mark.parametrize("size", [20, 30, 100, 10**6])
 def test_chunks_do_not_change_the_rays(kind, size):
     """Positions bitwise; shares, too, but for a profile's, whose norm is a sum over chunks: one rounding for each, 1e-13."""
-    profile = torch.rand(5, 3, dtype=torch.float64)
-    for p in (None, profile):
+    for p in (None, looked_up_in(torch.rand(5, 3, dtype=torch.float64))):
         sampler = Sampler(kind, (17, 29), 11, p)
         whole, cut = points(sampler), points(sampler, size)
         assert torch.equal(whole[0], cut[0])
@@ -218,7 +218,7 @@ def test_profile_lights_its_own_corner(kind):
     """[i, j], i along +x: only profile[-1, 0] is bright, so light starts at large u and small v alone."""
     profile = torch.zeros(4, 3, dtype=torch.float64)
     profile[3, 0] = 2.5
-    u, v, flux = points(Sampler(kind, (40, 42), 1, profile))
+    u, v, flux = points(Sampler(kind, (40, 42), 1, looked_up_in(profile)))
     lit = (u > 0.75) & (v < 1 / 3)
     assert 0 < int(lit.sum()) < len(u) / 4
     assert bool((flux[lit] > 0).all())
@@ -229,7 +229,7 @@ def test_profile_lights_its_own_corner(kind):
 @pytest.mark.parametrize("kind", SAMPLERS)
 def test_profile_weights_rays_by_its_value(kind):
     profile = torch.rand(4, 3, dtype=torch.float64) + 0.1
-    u, v, flux = points(Sampler(kind, (40, 42), 1, profile), 100)
+    u, v, flux = points(Sampler(kind, (40, 42), 1, looked_up_in(profile)), 100)
     value = profile[(u * 4).long(), (v * 3).long()]
     torch.testing.assert_close(flux, value / value.sum(), rtol=1e-13, atol=0)
     assert float(flux.sum()) == pytest.approx(1.0, abs=1e-12)
@@ -239,7 +239,7 @@ def test_a_profile_that_every_ray_misses_is_refused():
     profile = torch.zeros(3, 3, dtype=torch.float64)
     profile[0, 0] = 1.0
     with pytest.raises(InputError, match="use more rays"):
-        next(Sampler("grid", (1, 1), profile=profile).chunks())
+        next(Sampler("grid", (1, 1), profile=looked_up_in(profile)).chunks())
 
 
 @pytest.mark.parametrize(("rays", "aspect"), [(1, 1.0), (10, 1.0), (10**4, 1.0), (10**4, 3.0), (10**5, 0.1), (50, 1000.0)])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as fwd
-from helpers import pairwise
+from helpers import looked_up_in, pairwise
 from scipy.interpolate import BSpline
 
 from caustic_cli.errors import InputError
@@ -170,7 +170,7 @@ def test_energy(kind, f, fresnel, surface):
     scene = scene_of(fresnel)
     heights = heights_of(scene, LENSES[surface])
     profile = torch.linspace(0, 1, 12, dtype=torch.float64).view(4, 3)
-    for p in (None, profile):
+    for p in (None, looked_up_in(profile)):
         exposure = expose(scene, HeightField.of(scene.lens), heights, Sampler(kind, (26, 21), 5, p), f, chunk=200)
         assert set(exposure.lost) == set(LOSSES)
         assert float(exposure.image.sum()) + sum(exposure.lost.values()) == pytest.approx(1.0, abs=1e-12)

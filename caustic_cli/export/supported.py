@@ -63,6 +63,7 @@ MOULD = Capability("moulds", {"two sides": ONE_SIDE})
 SCRIPT = Capability(
     "script for LightTools",
     {
+        "user-defined source": SOURCE,
         "two sides": ONE_SIDE,
         **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
         **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
@@ -77,7 +78,6 @@ SCRIPT = Capability(
             " written",
         ),
         "several sources": "⟨script⟩ builds one source, so that several, which the archive alone holds, cannot be written",
-        "user-defined source": SOURCE,
         "elliptical disc": "⟨script⟩: its disc is round, so an elliptical one cannot be written",
         "circular aperture": "⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written",
     },

@@ -40,7 +40,7 @@ NEEDS_DISTANT_SOURCE = (
 )
 LENSLETS = Capability(
     "lenslet arrays",
-    {"near source": NEEDS_DISTANT_SOURCE, "user-defined source": "⟨lens.array⟩ is not for sources of type {scene.source.kind}"},
+    {"near source": NEEDS_DISTANT_SOURCE, "laser beam": "⟨lens.array⟩ would give each lenslet a beam of its own"},
 )
 
 

@@ -201,7 +201,9 @@ def stretching_surface(scene: Scene, x: np.ndarray, y: np.ndarray) -> np.ndarray
     to = BeamProjection(screen, lens.offset.thickness, lens.interaction.side, scene.source.axis)
     half, across = np.diag(lens.half_size), to.linear @ np.diag(screen.half_size)
     values, vectors = np.linalg.eigh(half @ across @ across.T @ half)
-    stretch = np.linalg.solve(half, vectors @ np.diag(np.sqrt(values)) @ vectors.T) @ np.linalg.inv(half) - np.diag(to.axial_scale)
+    stretch = np.linalg.solve(half, vectors @ np.diag(np.sqrt(values.clip(0.0))) @ vectors.T) @ np.linalg.inv(half) - np.diag(
+        to.axial_scale
+    )
     index = lens.effective_index
     at = np.stack(np.broadcast_arrays(x[:, None], y[None, :]))
     bent = 0.5 / to.gain(index) * np.einsum("iab,ij,jab->ab", at, stretch, at)

@@ -100,9 +100,7 @@ class LowerHull:
         first, other = self.neighbours
         return laguerre.walked(*self.planes, first, other, int(other[0]), x1, x2)
 
-    def touched(
-        self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list, inside
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def touched(self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list, inside: np.ndarray | None) -> tuple:
         """As of those on rows."""
         s = self.sites
         back, at = replace(s, y1=s.y1[missing], y2=s.y2[missing]).prices(phi, raster, inside)

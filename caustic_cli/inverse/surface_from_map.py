@@ -127,18 +127,15 @@ def surface(
     map_ = solve(source, target, half, target_half, **{**options, **(ROUGHLY if rough else {})})
     options.pop("start", None)
     x, y = corners(shape[0], half[0])[:, None], corners(shape[1], half[1])[None, :]
-    light = np.pad(np.asarray(source, dtype=np.float64), 1)
-    light = light[1:, 1:] + light[:-1, 1:] + light[1:, :-1] + light[:-1, :-1]
-    light /= light.sum()
-    pixel = [2.0 * h / s for h, s in zip(target_half, np.shape(target), strict=True)]
+    light, pixel = _at_corners(source), min(2.0 * h / s for h, s in zip(target_half, np.shape(target), strict=True))
     aim, shift = (map_.x + centre[0], map_.y + centre[1]), np.zeros((2, *light.shape))
     for again in range(corrections + 1):
         z = heights(map_, aim, x, y, d, index, z_screen, thickness, light > 0, projection)
         landing = land(z, x, y, d, index, z_screen, projection)
         off = np.nan_to_num(np.stack([w - t for w, t in zip(landing, aim, strict=True)]))
-        miss = float(np.sqrt((light * (off**2).sum(0)).sum()))
+        miss = _rms(off, light)
         off = _smoothed(off, map_)
-        settled = not np.sqrt((light * (off**2).sum(0)).sum()) > NEGLIGIBLE * min(pixel)
+        settled = not _rms(off, light) > NEGLIGIBLE * pixel
         if not rough and (settled or again == corrections):
             break
         if settled and projection and projection.aligned:
@@ -150,6 +147,18 @@ def surface(
         rough = False
         aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
     return MappedSurface(z, *landing, miss, shift, again, map_, time.perf_counter() - began)
+
+
+def _at_corners(source) -> np.ndarray:
+    """Light at the corners of source cells (n, m), that of the cells around each: (n + 1, m + 1), of sum 1."""
+    light = np.pad(np.asarray(source, dtype=np.float64), 1)
+    light = light[1:, 1:] + light[:-1, 1:] + light[1:, :-1] + light[:-1, :-1]
+    return light / light.sum()
+
+
+def _rms(off: np.ndarray, light: np.ndarray) -> float:
+    """RMS of displacements (2, n + 1, m + 1), weighted by the light."""
+    return float(np.sqrt((light * (off**2).sum(0)).sum()))
 
 
 def _check_place(index: float, z_screen: float, thickness: float) -> None:

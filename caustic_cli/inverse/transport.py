@@ -141,9 +141,7 @@ class _Envelope:
         """As of `laguerre.borders`; site: as `on` a raster."""
         return laguerre.borders(site, len(self.psi))
 
-    def touched(
-        self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list, inside
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def touched(self, missing: np.ndarray, phi: np.ndarray, site: np.ndarray, raster: list, inside: np.ndarray | None) -> tuple:
         """Prices at which the planes of these sites, indices (k,), touch phi, and the sites where they do, (k,) each; phi, site: as
         `on` the raster, whose part `inside` counts."""
         back, at = self.sites.prices(phi, raster, inside)
@@ -233,15 +231,15 @@ def solve(
     for fewer in levels if start is None else LEVELS[-1:]:
         goal = max(most_sites // fewer, 16)
         raster = [centres(_points(s * fewer**-0.5), h) for s, h in ((n, a), (m, b))]
-        inside = _inside(raster, sides)
+        light = _light(f, 0.0, raster, a, b, sides)
         old, sites = sites, _sites(pyramid, 1.0 / goal)
         linear = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)  # prices of the map that stretches the rectangle
         if start is not None:
-            psi = sites.prices(_resampled(start, (n, m), (a, b), raster), raster, inside)[0]
+            psi = sites.prices(_resampled(start, (n, m), (a, b), raster), raster, light.inside)[0]
         else:
             psi = linear if old is None else _refined(psi, old, sites, raster, (a, b), sides)
         enough = max(tolerance, MERGED) if fewer == levels[-1] else COARSE_TOLERANCE
-        found, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b, sides), enough, most)
+        found, error, taken = _newton(psi, sites, raster, light, enough, most)
         steps += taken
         failed = error > 10.0 * enough and (f.size > 1 or len(sides) > 0)  # Newton's method, in dark regions of the source
         if failed and start is not None:  # which were lit where the initial potential comes from
@@ -253,9 +251,7 @@ def solve(
             steps += all_taken
             found, error = min((found, error), other, key=lambda pair: pair[1])
         psi = found
-    psi, sites, error, taken = _without_empty(
-        psi, sites, error, taken, raster, _light(f, 0.0, raster, a, b, sides), tolerance, most
-    )
+    psi, sites, error, taken = _without_empty(psi, sites, error, taken, raster, light, tolerance, most)
     return _map(psi, sites, (n, m), (a, b), smooth, error, steps + taken, began)
 
 
@@ -290,7 +286,7 @@ def solve_displaced(
     return _map(psi, moved, shape, (a, b), smooth, error, taken, began)
 
 
-def _without_empty(psi, sites: _Sites, error: float, taken: int, raster: list, light: tuple, tolerance: float, most: int) -> tuple:
+def _without_empty(psi, sites: _Sites, error: float, taken: int, raster: list, light: _Light, tolerance: float, most: int) -> tuple:
     """Prices, sites, error, and steps taken: Newton's method without the sites whose cells the raster misses, after it has stopped
     with them at `error` after `taken` steps."""
     steps = 0

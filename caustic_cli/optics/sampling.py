@@ -162,9 +162,8 @@ class Sampler:
     shape: tuple[int, int]
     #: Of the random kinds.
     seed: int = 0
-    #: Relative irradiance over the aperture, as a function of u and v that can be broadcast, or (a, b), constant per cell; or None
-    #: (eq. 4.2.3, erratum E19).
-    profile: Callable[[Tensor, Tensor], Tensor] | Tensor | None = None
+    #: Relative irradiance over the aperture, a function of u and v that can be broadcast; or None (eq. 4.2.3, erratum E19).
+    profile: Callable[[Tensor, Tensor], Tensor] | None = None
     #: Where the samples live.
     device: str | torch.device = "cpu"
     #: Of any half widths.
@@ -225,13 +224,6 @@ class Sampler:
     def _irradiance(self, s: Sample) -> Tensor:
         u, v = 2.0 * s.u - 1.0, 2.0 * s.v - 1.0
         within = self.aperture.covers(u[:, None], v[None, :]) if s.tensor else self.aperture.covers(u, v)
-        return within.double() if self.profile is None else within * self._profile(s)
-
-    def _profile(self, s: Sample) -> Tensor:
-        assert self.profile is not None
-        u, v = (s.u[:, None], s.v[None, :]) if s.tensor else (s.u, s.v)
-        if not isinstance(self.profile, Tensor):
-            return self.profile(u, v)
-        profile = self.profile.to(self.device, torch.float64)
-        a, b = ((c * n).long().clamp_max(n - 1) for c, n in zip((u, v), profile.shape, strict=True))
-        return profile[a, b]
+        if self.profile is None:
+            return within.double()
+        return within * (self.profile(s.u[:, None], s.v[None, :]) if s.tensor else self.profile(s.u, s.v))

@@ -73,6 +73,7 @@ TRAITS: Mapping[str, Trait] = {
         lambda s: len(s.source.members) > 1 and any(one.rays is not None for one in s.source.members),
     ),
     "user-defined source": Trait("a type of source that other programs do not have", lambda s: s.source.kind not in KNOWN_SOURCES),
+    "laser beam": Trait("the beam of a laser", lambda s: any(one.beam for one in s.source.members)),
     "near source": Trait("a source nearby", lambda s: not s.source.distant, ("source.position",)),
     "tilted light": Trait("light that is tilted to the axis", lambda s: s.source.oblique, ("source.tilt",)),
     "light not parallel": Trait("light that is not parallel", lambda s: not s.source.parallel),

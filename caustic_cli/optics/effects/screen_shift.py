@@ -25,15 +25,9 @@ class ScreenShift(Effect):
         """Needed if the screen is decentred."""
         (a, b), (x, y) = scene.screen.shift, _centre(scene)
         off = max(abs(a - x), abs(b - y))
-        axis = "in the light" if x or y else "on the axis"
-        return Decision(
-            self.name,
-            off > SAME,
-            f"the screen is shifted by {a:g} and {b:g} mm" if off > SAME else f"the screen is {axis}",
-            off if off > SAME else 0.0,
-            0.0,
-            present=off > SAME,
-        )
+        some, centred = off > SAME, "centred on the light" if x or y else "on the axis"
+        how = f"shifted by {a:g} and {b:g} mm" if some else centred
+        return Decision(self.name, some, f"the screen is {how}", off, 0.0, present=some)
 
     def without(self, scene: Scene) -> Scene:
         """With a screen centred on that light."""

@@ -25,15 +25,11 @@ class ScreenTilt(Effect):
         """Needed if the screen is tilted to that light."""
         tilt, square = scene.screen.tilt, _square(scene)
         off = max(abs(a - b) for a, b in zip((*tilt, 0.0), (*square, 0.0), strict=False))
-        upright = "square to the light" if any(square) else "upright"
-        return Decision(
-            self.name,
-            off > SAME,
-            f"the screen is tilted by {' and '.join(f'{t:g}' for t in tilt)} degrees" if off > SAME else f"the screen is {upright}",
-            off if off > SAME else 0.0,
-            0.0,
-            present=off > SAME,
-        )
+        if some := off > SAME:
+            how = f"tilted by {' and '.join(f'{t:g}' for t in tilt)} degrees"
+        else:
+            how = "square to the light" if any(square) else "upright"
+        return Decision(self.name, some, f"the screen is {how}", off, 0.0, present=some)
 
     def without(self, scene: Scene) -> Scene:
         """With a screen square to that light."""

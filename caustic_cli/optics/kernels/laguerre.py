@@ -338,6 +338,15 @@ def _clip(px, py, owner, n, ax, ay, c, q, qx, qy, qowner):
 
 
 @njit(nogil=True)
+def _area(px, py, n):
+    """Area of a convex polygon of n vertices, counterclockwise."""
+    area = 0.0
+    for k in range(1, n - 1):
+        area += 0.5 * ((px[k] - px[0]) * (py[k + 1] - py[0]) - (px[k + 1] - px[0]) * (py[k] - py[0]))
+    return area
+
+
+@njit(nogil=True)
 def density(f, x, y, a, b):
     """Bilinear value at (x, y) of the cell values f over [-a, a] x [-b, b]."""
     n, m = f.shape
@@ -435,9 +444,7 @@ def _cells(task, psi, y1, y2, site, head, link, end, degree, f, level, a, b, sid
             if outside:
                 n = _clip(px, py, po, n, ax, ay, c, np.int32(-1), qx, qy, qo)
                 px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
-        area = 0.0
-        for k in range(1, n - 1):
-            area += 0.5 * ((px[k] - px[0]) * (py[k + 1] - py[0]) - (px[k + 1] - px[0]) * (py[k] - py[0]))
+        area = _area(px, py, n)
         if not area > 0.0:
             continue
         light = level[p]
