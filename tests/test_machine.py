@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial import cKDTree
 from test_export import make
 
 from caustic_cli import cli
@@ -225,7 +226,7 @@ def test_two_parsers_read_the_same_path(tmp_path, lens, path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("G20\nG1 X0 Y0 Z0\n", "line 1: G20"),
+        ("G91\nG1 X0 Y0 Z0\n", "line 1: G91"),
         ("G2 X1 Y1 I1 J0\n", "G2 is not read"),
         ("G91\nG1 X1 Y1 Z1\n", "G91"),
         ("X1 Y2 Z3\n", "without G0 or G1"),
@@ -441,6 +442,27 @@ def test_height_maps_that_are_none_are_refused(tmp_path, lens):
     Image.fromarray(np.zeros((4, 4), np.uint8)).save(tmp_path / "z.png")
     with pytest.raises(InputError):
         read_surface(tmp_path / "z.png", half)
+
+
+@pytest.mark.parametrize("dialect", ["inch", "simple", "simple-inch"])
+def test_dialects_say_the_same(tmp_path, dialect):
+    scene, field, heights = spline(lambda x, y: 5.0 + 0.002 * (x * x + y * y))
+    part = part_of("gcode", scene, field, heights)
+    tips, figures = {}, {}
+    for one in ("mm", dialect):
+        milling = Milling(scallop=0.02, roughing=0.5, dialect=one)
+        figures[one] = write_gcode(tmp_path / one, part, milling)
+        tips[one] = np.concatenate([cut.tips for cut in read_program(tmp_path / one).cuts])
+    text = (tmp_path / dialect).read_text()
+    assert ("G20" in text) == dialect.endswith("inch") and ("G21" in text) != dialect.endswith("inch")
+    moves = [line for line in text.splitlines() if line.startswith(("G0", "G1 "))]
+    if dialect.startswith("simple"):
+        assert all(line.startswith("G1 ") and " F" in line for line in moves)
+    else:
+        assert any(line.startswith("G0") for line in moves) and sum(" F" in line for line in moves) < 0.2 * len(moves)
+    assert cKDTree(tips[dialect]).query(tips["mm"])[0].max() < 2e-4  # with more digits some more moves are not empty
+    for key in ("length_mm", "minutes"):
+        assert figures[dialect][key] == pytest.approx(figures["mm"][key], rel=1e-4)
 
 
 # the command

@@ -132,6 +132,15 @@ class OutputOptions(options.Given):
             " including scallops.",
         ),
     ] = None
+    finish: Annotated[
+        str | None,
+        typer.Option(
+            metavar="STEP[+STEP...]|list",
+            help="Trace the part as finishing leaves it: sanded:GRIT[,GRIT...], polished:UM (removed on average), coated:UM,"
+            " printed:LAYER,PIXEL[,COAT] (µm), milled:FILE (G-code), joined by +; list: the error by each of several.  [default:"
+            " what the design was corrected for]",
+        ),
+    ] = None
     tolerances: Annotated[
         Path | None,
         typer.Option(
@@ -256,9 +265,10 @@ def _checked_size(asked: RenderOptions) -> list[int]:
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {asked.tolerance:g}")
     size = tuple(options.both(options.counts("--filter-size", asked.filter_size)))
     radius = asked.tool_radius
-    if radius is not None and not ((asked.report or asked.cut) and radius > 0):
-        raise InputError(f"--tool-radius belongs to --report and --cut and must be greater than 0 mm, got {radius:g}")
-    designed = [option for option in ("verify", "explain", "html", "rays-plot", "day") if getattr(asked, option.replace("-", "_"))]
+    if radius is not None and not ((asked.report or asked.cut or asked.finish) and radius > 0):
+        raise InputError(f"--tool-radius belongs to --report, --cut and --finish and must be greater than 0 mm, got {radius:g}")
+    others = ("verify", "explain", "html", "rays-plot", "day", "finish")
+    designed = [option for option in others if getattr(asked, option.replace("-", "_"))]
     if asked.cut and designed:
         raise InputError(f"--cut goes without --{designed[0]}, which looks at the surface as designed")
     if asked.verify not in (None, "mitsuba"):

@@ -16,6 +16,7 @@ from caustic_cli.inverse.loss_terms import parse
 from caustic_cli.inverse.parametrisation import Architecture, Parametrisation
 from caustic_cli.inverse.problem import Options
 from caustic_cli.inverse.schedule import LossImage, Stage
+from caustic_cli.optics import finishing
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.region import Region
 from caustic_cli.scene import Screen
@@ -97,6 +98,8 @@ def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
 def build_options(settings: Settings) -> Options:
     """The design options of complete settings."""
     d = settings.design
+    if settings.lens.finish:
+        finishing.refuse_program(finishing.parse(settings.lens.finish))
     check_all("design", d, "dtype", "seed", "iterations")
     for key in ("time_limit", "checkpoint_every"):  # which may be infinite
         if not d[key] > 0:

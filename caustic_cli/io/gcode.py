@@ -1,8 +1,8 @@
 """Reader of three-axis G-code programs (RS-274): linear moves, by tool.
 
-Supported are G0 and G1 with X, Y, Z in absolute millimetres, one motion per block, without block delete; G17, G21, G90, G94, F, S,
-M and N words are ignored; comments are in parentheses or after a semicolon.  Arcs, inches, relative moves, cycles, offsets and
-parameters are refused, since the simulated cut would be wrong.
+Supported are G0 and G1 with X, Y, Z in absolute millimetres (G21) or inches (G20), one motion per block, without block delete;
+G17, G90, G94, F, S, M and N words are ignored; comments are in parentheses or after a semicolon.  Arcs, relative moves, cycles,
+offsets and parameters are refused, since the simulated cut would be wrong.
 
 Comments of exported programs give the tool, the stock, and the orientation of the part: see `export.milling.gcode`.
 """
@@ -19,11 +19,13 @@ import numpy as np
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import naming, open_regular
 
-ACCEPTED = "a program of G0 and G1 moves in millimetres is needed"
+ACCEPTED = "a program of G0 and G1 moves is needed"
 #: Largest program read, bytes: some 20 million moves.
 MOST_BYTES = 1 << 29
+#: Words of units, and mm of each.
+UNITS = {"G20": 25.4, "G21": 1.0}
 #: G words without influence on the tool path, or with the assumed modes; and ignored letters.
-IGNORED = {"G17", "G21", "G40", "G49", "G54", "G61", "G64", "G80", "G90", "G94", *"FSTMNH"}
+IGNORED = {"G17", "G40", "G49", "G54", "G61", "G64", "G80", "G90", "G94", *"FSTMNH"}
 
 _WORD = re.compile(r"([A-Z])\s*([+-]?(?:\d+\.?\d*|\.\d+))")
 _COMMENT = re.compile(r"\([^()]*\)|;.*")
@@ -67,6 +69,8 @@ class _Interpreter:
         #: G0 or G1, None before the first; the position, nan where unknown.
         self.motion: str | None = None
         self.position = [math.nan] * 3
+        #: mm of a coordinate's unit.
+        self.unit = 1.0
 
     def read(self, line: str, number: int) -> None:
         """Read a line; InputError if it is not supported."""
@@ -80,7 +84,7 @@ class _Interpreter:
         moved = False
         for letter, value in _WORD.findall(line):
             if letter in "XYZ":
-                self.position["XYZ".index(letter)] = float(value)
+                self.position["XYZ".index(letter)] = float(value) * self.unit
                 moved = True
             else:
                 self._mode(letter, value, number)
@@ -102,6 +106,8 @@ class _Interpreter:
         code = f"G{float(value):g}" if letter == "G" else letter
         if code in ("G0", "G1"):
             self.motion = code
+        elif code in UNITS:
+            self.unit = UNITS[code]
         elif code not in IGNORED:
             raise InputError(f"line {number}: {code} is not read; {ACCEPTED}")
 

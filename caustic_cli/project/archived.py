@@ -69,6 +69,10 @@ class ArchivedLens:
         """Resolution of the lens by diffraction."""
         return Resolution.at(scene, field, heights)
 
+    def made(self, field: HeightField, heights: Tensor) -> tuple[HeightField, Tensor]:
+        """The surface to be made, which is that in the archive."""
+        return field, heights
+
     def moved(self, path: Path) -> NoReturn:
         """Refuse to become a project."""
         raise InputError("an archive's lens has no picture and no design, so it cannot be saved as a project")

@@ -26,6 +26,7 @@ from caustic_cli.inverse.target import target_on_screen, tiles
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.kinds import problem_of
+from caustic_cli.optics import finishing
 from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -249,6 +250,11 @@ class Project:
         except InputError as error:
             raise self.error(f"{error}") from error
         return Designed(scene, field, heights, state)
+
+    def made(self, field: HeightField, heights: Tensor) -> tuple[HeightField, Tensor]:
+        """The surface to be made: corrected for how it is finished, the designed one without a finish."""
+        finish = self.settings.lens.finish
+        return finishing.corrected(finishing.parse(finish), field, heights) if finish else (field, heights)
 
     @property
     def seed(self) -> int:

@@ -347,6 +347,9 @@ class LensSettings(Section):
             1e6, default=0.0, written=False, option=Option("--absorption", "PER_MM", BOTH))
     roughness: float = setting("standard deviation of the exit's microfacet slopes along an axis, mm per mm", low=0.0, high=1.0,
             default=0.0, written=False, option=Option("--roughness", "SLOPE", BOTH))
+    finish: str = setting("how the part is finished, for which the surface to be made is corrected: sanded:GRIT[,GRIT...],"
+            " polished:UM, coated:UM or printed:LAYER,PIXEL[,COAT] (µm), joined by +; empty: it is made as designed", default="",
+            written=False, option=Option("--finish", "STEP[+STEP...]"))
     mirror: bool = setting("the surface is a mirror, with the screen on the source's side, beside its light", default=False,
             written=False, option=Option("--mirror"))
     aperture: str = setting("shape of the lens: rectangle, or circle, the largest within size", choices=("rectangle", "circle"),

@@ -272,6 +272,7 @@ def exporter_of(project: Path, at: str | None, say: Reporter, most: float = MOST
     scene = opened.scene()
     target = opened.target(scene)
     scene, field, heights, checkpoint = opened.lens(scene)
+    field, heights = opened.made(field, heights)
     waves = checkpoint.results.get("wave_relative_rms") is not None and checkpoint.results.get("error_by", "waves") == "waves"
     return Exporter(scene, field, heights, target, waves, opened.settings.design.seed, most, say), opened
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,11 @@ class Lens:
         scene = self.origin.scene(given)
         scene = replace(scene, lens=replace(scene.lens, entrance=self.scene.lens.entrance), elements=self.scene.elements)
         return replace(self, scene=scene, target=self.origin.target(scene))
+
+    @cached_property
+    def made(self) -> tuple[HeightField, Tensor]:
+        """The surface to be made, corrected for its finish."""
+        return self.origin.made(self.field, self.heights)
 
     @property
     def seed(self) -> int:
@@ -241,7 +247,7 @@ class Lens:
         path = Path(path)
         name = format_of(path, format)
         given: dict[str, Any] = {key: value for key, value in (("samples", samples), ("tolerance", tolerance)) if value is not None}
-        exporter = Exporter(self.scene, self.field, self.heights, self.target, self.by_waves, self.seed)
+        exporter = Exporter(self.scene, *self.made, self.target, self.by_waves, self.seed)
         exporter.write(path, name, script, mould, block, milling, **given)
         return path
 

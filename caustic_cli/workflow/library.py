@@ -39,6 +39,7 @@ from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import lamp, lens
+from caustic_cli.workflow.finishing import of_design
 from caustic_cli.workflow.lamp import LampDesign
 from caustic_cli.workflow.lens import Lens, Render, count
 from caustic_cli.workflow.movie import recorder
@@ -162,7 +163,7 @@ def design_of(
         if error is None or estimate.reached(done.figures, error, quality, say):
             break
         force = True  # it replaces the lens that was not good enough
-    return _lens(done, device)
+    return _lens(done, device, say)
 
 
 def resume(
@@ -188,7 +189,7 @@ def resume(
         _refuse_for_lamps({"movie": movie, "design.iterations": iterations, "design.time_limit": time_limit}, device)
         return lamp.resume(Project.open(path), say or Listener())
     began, say, recording = Start.now(), say or Listener(), recorder(movie, force)
-    return _lens(workflow.resume(Project.open(path), iterations, time_limit, device, say, began, recording), device)
+    return _lens(workflow.resume(Project.open(path), iterations, time_limit, device, say, began, recording), device, say)
 
 
 def _refuse_for_lamps(given: Mapping[str, Any], device: str) -> None:
@@ -213,9 +214,11 @@ def load(path: str | Path, at: str | None = None, **given: Any) -> Lens | LampDe
     return lens.load(path, at, **given)
 
 
-def _lens(done: workflow.Result, device: str) -> Lens:
+def _lens(done: workflow.Result, device: str, say: Reporter) -> Lens:
     made = workflow.provenance(done.project, device)
-    return Lens(done.scene, done.field, done.heights, done.target, done.figures, done.project, done.state, made)
+    lens = Lens(done.scene, done.field, done.heights, done.target, done.figures, done.project, done.state, made)
+    lens.figures.update(of_design(lens, say))
+    return lens
 
 
 def render(lens: Lens | LampDesign | str | Path, rays: float | None = None, **options: Any) -> Render:

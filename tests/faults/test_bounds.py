@@ -449,6 +449,7 @@ READ = {
     "render --intensity": "render a.caustic --source point --intensity @.csv",
     "render --screen-shape": "render a.caustic --screen-shape @.npy",
     "render --cut": "render a.caustic --cut @.nc",
+    "render --finish": "render a.caustic --finish milled:@.nc",
     "render --tolerances": "render a.caustic --tolerances @.toml",
     "render --want": "render a.caustic --want @.png",
 }

@@ -13,6 +13,8 @@ from caustic_cli.schema import checks
 
 PATHS = ("raster", "raster-y", "spiral")
 TOOLS = ("ball", "flat")
+#: Words of a program: G0 for rapid moves and F where it changes, or G1 with F in every move; in mm or inches.
+DIALECTS = ("mm", "inch", "simple", "simple-inch")
 #: Largest concave curvature, over that of the tool, for which the step-over is reduced; beyond, material is left in any case.
 FITS = 0.75
 
@@ -30,6 +32,9 @@ class Milling:
     scallop: float = _setting(0.001, "Height of the scallops that finishing leaves, at most; sets the step-over.", "mm", 10.0)
     step_over: float | None = _setting(None, "Distance between passes instead.", "mm", 1e3)
     path: str = _setting("raster", "raster (along x), raster-y, or spiral from the middle outwards.", choices=PATHS)
+    dialect: str = _setting(
+        "mm", "Words of the program: mm; inch (G20); simple, simple-inch: G1 with a feed in every line, no G0.", choices=DIALECTS
+    )
     feed: float = _setting(600.0, "Feed along the path.", "mm/min")
     plunge: float = _setting(200.0, "Feed straight down.", "mm/min")
     spindle: float = _setting(20000.0, "Spindle speed.", "1/min")

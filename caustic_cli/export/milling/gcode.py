@@ -1,4 +1,4 @@
-"""G-code programs for a three-axis mill (RS-274: G0, G1, G17, G21, G90, G94, M0, M3, M5, M30).
+"""G-code programs for a three-axis mill (RS-274: G0, G1, G17, G20 or G21, G90, G94, M0, M3, M5, M30).
 
 X0 Y0 is the centre of the part, on its axis; Z0 is its flat face, on the table; Z points up.  X, Y, Z are coordinates of the tool
 tip.  A mirror, or the mould of a lens, is turned over: the (x, y, z) of the scene is (x, -y, -z) of the program, plus the height of
@@ -47,6 +47,8 @@ FIRST_MOVE, AT_A_TIME = 0.125, 4096
 FACING = 0.1
 #: Roughing: step-over over the radius, tolerance over the allowance.
 ROUGH_STEP, ROUGH_PART = 0.5, 0.05
+#: mm of an inch.
+INCH = 25.4
 #: Rapid feed for the estimated time, mm/min: mills have 3 to 30 m/min.
 RAPID = 3000.0
 #: Reserved length of the comment with the number of lines and the time, which is written last.
@@ -55,10 +57,15 @@ COUNTED = 100
 
 @dataclass
 class _Writer:
-    """Writes moves and accumulates lines, length and time."""
+    """Writes moves and accumulates lines, length and time.
+
+    digits: of coordinates, in the unit of the program, of `unit` mm; simple: rapid moves are linear ones, and all have their feed.
+    """
 
     file: object
     digits: int
+    unit: float = 1.0
+    simple: bool = False
     lines: int = 0
     minutes: float = 0.0
     length: float = 0.0
@@ -76,10 +83,9 @@ class _Writer:
 
     def rapid(self, x: float | None = None, y: float | None = None, z: float | None = None) -> None:
         """Rapid move (G0) in x and y, or in z."""
-        if x is not None:
-            self.say(f"G0 {self.forms[3] % (x, y)}")
-        else:
-            self.say(f"G0 {self.forms[4] % z}")
+        word, feed = ("G1", f" F{RAPID / self.unit:.6g}") if self.simple else ("G0", "")
+        to_there = self.forms[3] % (x / self.unit, y / self.unit) if x is not None else self.forms[4] % (z / self.unit)
+        self.say(f"{word} {to_there}{feed}")
         before = self.at or (x or 0.0, y or 0.0, z or 0.0)
         to = (before[0] if x is None else x, before[1] if y is None else y, before[2] if z is None else z)
         self.minutes += math.dist(before, to) / RAPID
@@ -87,25 +93,28 @@ class _Writer:
 
     def cut(self, points: np.ndarray, feed: float) -> None:
         """Linear moves (G1) through points (m, 3), mm; unchanged coordinates are omitted."""
-        points = np.round(points, self.digits) + 0.0
-        before = np.concatenate([[self.at], points[:-1]])
+        points = np.round(points / self.unit, self.digits) + 0.0
+        before = np.concatenate([[np.asarray(self.at) / self.unit], points[:-1]])
         changed = points != before
         moved = changed.any(1)
         points, before, changed = points[moved], before[moved], changed[moved]
         if not len(points):
             return
         masks = (changed @ [1, 2, 4]).tolist()
+        words = f" F{feed / self.unit:.6g}"
         rows = [
             "G1 " + self.forms[mask] % tuple(v for v, c in zip(row, kept, strict=True) if c)
             for mask, row, kept in zip(masks, points.tolist(), changed.tolist(), strict=True)
         ]
-        if feed != self.feed:
-            rows[0] += f" F{feed:g}"
-            self.feed = feed
+        if self.simple:
+            rows = [row + words for row in rows]
+        elif feed != self.feed:
+            rows[0] += words
+        self.feed = feed
         self.file.write(("\n".join(rows) + "\n").encode("ascii"))
-        long = float(np.linalg.norm(points - before, axis=1).sum())
+        long = float(np.linalg.norm(points - before, axis=1).sum()) * self.unit
         self.lines, self.length, self.minutes = self.lines + len(rows), self.length + long, self.minutes + long / feed
-        self.at = tuple(points[-1].tolist())
+        self.at = tuple((points[-1] * self.unit).tolist())
 
 
 def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, tolerance: float | None = None) -> dict:
@@ -132,7 +141,8 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     step = spacing(m.path, outline, step)
     scallop = m.scallop_of(step, concave, slope)
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
-    digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance)) + MORE_DIGITS)
+    unit = INCH if m.dialect.endswith("inch") else 1.0
+    digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance / unit)) + MORE_DIGITS)
     top = _stock(m, high)
     dips = low - m.tool_radius + math.sqrt(m.tool_radius**2 - min(2.0 * over * over, 0.99 * m.tool_radius**2))
     if dips < 0.0:
@@ -143,10 +153,10 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
     passes = spiral(outline, step) if m.path == "spiral" else raster(outline, step, lines[m.path])
     with atomic_file(path) as file:
-        out = _Writer(file, digits)
+        out = _Writer(file, digits, unit, m.dialect.startswith("simple"))
         out.say(*_head(part, m, step, scallop, top, digits, tolerance))
         place = file.tell()
-        out.say(" " * COUNTED, "G21 G90 G17 G94")
+        out.say(" " * COUNTED, f"{'G21' if unit == 1.0 else 'G20'} G90 G17 G94")
         if m.roughing is not None:
             _begin(out, m.roughing_tool, m.rough_radius, m.spindle, safe)
             _rough(out, m, field, heights, part.lens.opening, top, low, safe)
@@ -182,7 +192,7 @@ def _head(part: Part, m: Milling, step: float, scallop: float, top: float, digit
         "(X0 Y0: the middle of the part; X Y Z are of the tool's tip)",
         f"(stock: {wide:g} x {high:g} x {top:g} mm, top at Z{top:g})",
         f"(finishing: {m.path}, step-over {step:.6g} mm, scallops up to {scallop:.3g} mm, moves within {tolerance:.3g} mm)",
-        f"(units: mm, mm/min; {digits} decimals)",
+        f"(units: {'inches, inches' if m.dialect.endswith('inch') else 'mm, mm'}/min; {digits} decimals; comments in mm)",
     ]
 
 

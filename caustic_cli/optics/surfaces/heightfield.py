@@ -124,6 +124,11 @@ class HeightField(Surface[Tensor]):
         z = over_grid(u, heights.detach().double().cpu(), v)
         return float(z[aperture.covers(2.0 * points[0][:, None] - 1.0, 2.0 * points[1][None, :] - 1.0)].min())
 
+    def on_grid(self, heights: Tensor, shape: tuple[int, int]) -> Tensor:
+        """Heights on an equidistant grid over the aperture, its borders included: of this shape, mm."""
+        u, v = (s.banded(torch.linspace(0.0, 1.0, n, dtype=torch.float64)) for s, n in zip(self.spaces, shape, strict=True))
+        return over_grid(u, heights.detach().double().cpu(), v)
+
     def centred(self, heights: Tensor) -> tuple[Tensor, float]:
         """Heights minus their mean, and the mean, mm: a sag small compared with the thickness keeps all its digits."""
         middle = float(heights.detach().double().mean())

@@ -9,6 +9,7 @@ from caustic_cli.workflow.outputs.base import Output
 from caustic_cli.workflow.outputs.cut import MachinedSurface
 from caustic_cli.workflow.outputs.day import DayOfSunlight
 from caustic_cli.workflow.outputs.explanation import Explanation
+from caustic_cli.workflow.outputs.finish import FinishedPart
 from caustic_cli.workflow.outputs.hours import Hours
 from caustic_cli.workflow.outputs.illumination import Illumination
 from caustic_cli.workflow.outputs.image import RayPicture
@@ -28,6 +29,7 @@ OUTPUTS: tuple[type[Output], ...] = (
     WavePicture,
     PixelValues,
     MachinedSurface,
+    FinishedPart,
     InteractivePage,
     Explanation,
     ManufacturingReport,

@@ -1,0 +1,133 @@
+"""Lenses as they are finished: what a finish makes of a part, what that costs, and what the correction for it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+
+from caustic_cli.optics import finishing
+from caustic_cli.optics.finishing import Relief
+from caustic_cli.scene import Scene
+from caustic_cli.workflow.lens import Lens
+from caustic_cli.workflow.machining import cut_surface
+from caustic_cli.workflow.reporter import Reporter
+
+#: Finishes of `compared`, the coarsest first.
+LADDER = ("sanded:400,800,2000+polished:5", "sanded:2000+polished:5", "polished:20", "polished:5", "polished:1")
+LADDER += ("coated:50", "coated:20", "coated:5")
+#: Points along each axis at which surfaces are compared.
+SURVEY = 301
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part that is made of a lens and finished.
+
+    Args:
+        finish: as of `optics.finishing.parse`; tool_radius: mm, for a program that does not state it.
+        corrected: whether it is made as `Lens.made`, or else as designed.
+
+    Raises:
+        InputError: the finish is not written so, or a program cannot be read.
+    """
+
+    lens: Lens
+    finish: str
+    tool_radius: float | None = None
+    corrected: bool = True
+
+    @cached_property
+    def steps(self) -> tuple[finishing.Finish, ...]:
+        """Of the finish."""
+        return finishing.parse(self.finish)
+
+    @cached_property
+    def relief(self) -> Relief:
+        """As it is made: as a program cuts it, or else without errors."""
+        lens, program = self.lens, self.steps[0].program
+        shape = finishing.points(self.steps, lens.field)
+        if program:
+            return Relief.of(cut_surface(program, lens.scene, lens.field, self.tool_radius), lens.field.half_size, shape)
+        field, heights = lens.made if self.corrected else (lens.field, lens.heights)
+        return Relief(field.on_grid(heights, shape).numpy(), field.half_size)
+
+    def finished(self, strength: float = 0.0) -> Lens:
+        """The lens in its scene with the finished surface; strength: of the steps within what is known of them, -1 to 1."""
+        steps = tuple(step.by(strength) for step in self.steps)
+        field, heights = finishing.finished(steps, self.relief, self.lens.field)
+        return replace(self.lens, field=field, heights=heights, scene=_rough(self.lens.scene, finishing.roughness(steps).slope))
+
+    @property
+    def scattered(self) -> float:
+        """Fraction of the light that the roughness scatters; wave images leave it out."""
+        scene = self.lens.scene
+        return finishing.roughness(self.steps).scattered(abs(scene.lens.effective_index - 1.0), scene.light.mean)
+
+    def unsure(self, **how: Any) -> list[float | None]:
+        """Errors for weaker and for stronger steps; how: arguments of `judged`."""
+        return [judged(self.finished(strength), **how)["error"] for strength in (-1.0, 1.0)]
+
+
+def _rough(scene: Scene, slope: float) -> Scene:
+    """With a surface whose facets have these slopes beside their own, if they matter."""
+    if slope < finishing.SMOOTH:
+        return scene
+    whole = float(torch.tensor([scene.lens.roughness, slope]).norm())
+    return replace(scene, lens=replace(scene.lens, roughness=min(whole, 1.0)))
+
+
+def of_design(lens: Lens, say: Reporter) -> dict[str, Any]:
+    """What the correction for the finish of a new design is worth, also said: finish, with steps, the error of the finished part,
+    error_by and noise, uncorrected_error, and relief_um, by how much the surface to be made departs from the designed one; empty
+    without a finish."""
+    finish = lens.project.settings.lens.finish if lens.project else ""
+    if not finish:
+        return {}
+    with say.notify_if_slow("tracing the finished part"):
+        found, plain = (judged(Part(lens, finish, corrected=corrected).finished()) for corrected in (True, False))
+    off = deviation(replace(lens, field=lens.made[0], heights=lens.made[1]), lens)["most_um"]
+    say.say(
+        f"finished ({finish}), the corrected part has an error of {found['error']:.4f} by {found['error_by']}, one made as designed"
+        f" {plain['error']:.4f}; the surface to be made, which is exported, is up to {off:.3g} µm off the designed one"
+    )
+    return {"finish": found | {"steps": finish, "uncorrected_error": plain["error"], "relief_um": off}}
+
+
+def deviation(lens: Lens, of: Lens) -> dict[str, float]:
+    """By how much a surface differs from another beside piston, for JSON: rms_um, most_um, and slope_rms."""
+    line = [torch.linspace(-r, r, SURVEY, dtype=torch.float64) * (1.0 - 1e-9) for r in of.field.half_size]
+    x, y = (c.reshape(-1) for c in torch.meshgrid(*line, indexing="ij"))
+    z, gx, gy = (a - b for a, b in zip(lens.field.at(lens.heights, x, y), of.field.at(of.heights, x, y), strict=True))
+    off = 1e3 * (z - z.mean())
+    return {
+        "rms_um": float(off.std()),
+        "most_um": float(off.abs().max()),
+        "slope_rms": float(torch.hypot(gx, gy).square().mean().sqrt()),
+    }
+
+
+def judged(lens: Lens, rays: float | None = None, **how: Any) -> dict[str, Any]:
+    """The figures of a lens by its judge: error, error_by, noise; by waves where the design was refined on them."""
+    figures = lens.render(rays, **how).figures
+    if lens.by_waves:
+        figures = {**figures, **lens.render_waves(required=False).figures}
+    return {key: figures.get(key) for key in ("error", "error_by", "noise")}
+
+
+def compared(lens: Lens, finishes: tuple[str, ...] | None = None) -> list[Mapping[str, Any]]:
+    """The lens as designed, and each finish, those of LADDER unless given, with its error and those for the weaker and the stronger
+    end of what is known of it: finish, error, low, high, error_by, slope_rms, and scattered, the fraction of light that roughness
+    scatters."""
+    rows: list[Mapping[str, Any]] = [{"finish": "as designed", **judged(lens), "slope_rms": 0.0, "scattered": 0.0}]
+    for finish in finishes or LADDER:
+        part = Part(lens, finish)
+        now = part.finished()
+        figures = judged(now)
+        errors = sorted(e for e in (figures["error"], *part.unsure()) if e is not None) or [None]
+        more = {"low": errors[0], "high": errors[-1], "slope_rms": deviation(now, lens)["slope_rms"]}
+        rows.append({"finish": finish, **figures, **more, "scattered": part.scattered})
+    return rows

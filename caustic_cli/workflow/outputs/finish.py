@@ -1,0 +1,101 @@
+"""The part as it is finished, traced instead of the designed surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from caustic_cli.optics import finishing as steps_of
+from caustic_cli.workflow import finishing
+from caustic_cli.workflow.lens import Lens
+from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
+
+#: Instead of a finish: all of a ladder are compared.
+LIST = "list"
+#: Fraction of scattered light that is not mentioned.
+FEW = 0.005
+
+
+@dataclass(eq=False)
+class FinishedPart(Output):
+    """The part as `finish` leaves it, by default that for which the project was corrected; tool_radius: mm, for a program that does
+    not state it."""
+
+    finish: str | None = None
+    tool_radius: float | None = None
+    part: finishing.Part | None = field(default=None, init=False)
+    ladder: list[Any] = field(default_factory=list, init=False)
+
+    @property
+    def shows(self) -> dict[str, object]:
+        if self.finish in (None, LIST):
+            return {}
+        programs = [fingerprint(step.program) for step in steps_of.parse(self.finish or "") if step.program]
+        return {"finish": self.finish, **({"finished program": programs} if programs else {})}
+
+    @property
+    def asks(self) -> dict[str, object]:
+        return {"finish": self.finish} | self.shows if self.finish else {}
+
+    def _of(self, lens: Lens) -> str:
+        """The finish, "" for none."""
+        return self.finish or (lens.project.settings.lens.finish if lens.project else "")
+
+    def prepare(self, rendering: Rendering) -> None:
+        finish = self._of(rendering.lens)
+        if finish == LIST:
+            with rendering.say.notify_if_slow("tracing the lens as each of the finishes leaves it"):
+                self.ladder = finishing.compared(rendering.lens)
+        elif finish:
+            self.part = finishing.Part(rendering.lens, finish, self.tool_radius)
+            rendering.lens = self.part.finished()
+
+    def write(self, rendering: Rendering) -> dict[str, Any]:
+        """finishes, or finish: the steps, error, error_by and noise as designed, and for the weaker and the stronger end of what is
+        known of the steps; the deviation from the designed surface, and the roughness that is left."""
+        if self.ladder:
+            return {"finishes": self.ladder}
+        if self.part is None:
+            return {}
+        designed, how = self.part.lens, {"rays": rendering.rays, "seed": rendering.seed}
+        figures: dict[str, Any] = {
+            "steps": self.part.finish,
+            "roughness": rendering.scene.lens.roughness,
+            "scattered": self.part.scattered,
+        }
+        figures |= {f"nominal_{key}": value for key, value in finishing.judged(designed, **how).items()}
+        figures |= dict(zip(("weaker_error", "stronger_error"), self.part.unsure(**how), strict=True))
+        return {"finish": figures | finishing.deviation(rendering.lens, designed)}
+
+    def show(self, figures: dict[str, Any], say: Any) -> None:
+        if found := figures.get("finishes"):
+            say.table("finishes: error, and that of weaker and stronger steps", [(row["finish"], _words(row)) for row in found])
+        if f := figures.get("finish"):
+            rows = []
+            if figures["error"] is not None:
+                error = f"{figures['error']:.4f} by {figures['error_by']}; as designed {f['nominal_error']:.4f}"
+                unsure = f"weaker ones {f['weaker_error']:.4f}, stronger ones {f['stronger_error']:.4f}"
+                rows += [("relative RMS error", error), ("steps known to a factor", unsure)]
+            rough = (
+                f"slopes RMS {f['roughness']:.2g}, scatters {f['scattered']:.0%} of the light"
+                if f["roughness"]
+                else "none that matters"
+            )
+            rows += [
+                ("off the designed surface", f"RMS {f['rms_um']:.3g} µm, up to {f['most_um']:.3g} µm"),
+                ("slopes off by", f"RMS {f['slope_rms']:.3g}"),
+                ("roughness left", rough),
+            ]
+            say.table(f"as finished, {f['steps']}", rows)
+
+
+def _words(row: dict[str, Any]) -> str:
+    """A row of the ladder."""
+    slopes = f"slopes off by RMS {row['slope_rms']:.2g}"
+    if row["error"] is None:
+        return slopes
+    error = f"{row['error']:.4f} by {row['error_by']}"
+    if "low" not in row:
+        return error
+    rough = f", scatters {row['scattered']:.0%} of the light" if row["scattered"] > FEW else ""
+    return f"{error} ({row['low']:.3f} to {row['high']:.3f}), {slopes}{rough}"
