@@ -9,6 +9,7 @@ from typing import Any
 from caustic_cli.config import presets
 from caustic_cli.config.settings import Given, Settings, index_of, read
 from caustic_cli.errors import InputError
+from caustic_cli.scene import anglemap
 from caustic_cli.scene.lamp import NEAREST, Chip, Goal, Lamp
 from caustic_cli.schema.table import (
     DesignSettings,
@@ -71,6 +72,8 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
     if far not in (None, "far"):
         raise InputError(f"⟨screen_place⟩ of a lamp must be far, or be left out for a screen at ⟨+throw⟩, got {far}")
     if lamp.angles is None:
+        if "projection" in lamp:
+            raise InputError("⟨lamp.projection⟩ belongs to the far field, which ⟨+lamp.angles⟩ makes")
         if far:
             raise InputError("⟨screen_place⟩ far needs ⟨+lamp.angles⟩, the size of the picture in degrees")
         if "picture_size" not in by and "size" not in target:
@@ -137,4 +140,7 @@ def goal_of(settings: Settings) -> Goal:
     s = settings.lamp
     assert s is not None
     shift = settings.screen.shift
-    return Goal(settings.target.size, settings.screen.z, shift) if s.angles is None else Goal(s.angles)
+    if s.angles is None:
+        return Goal(settings.target.size, settings.screen.z, shift)
+    width, height = (anglemap.extent_of(s.projection, angle) for angle in s.angles)
+    return Goal((width, height), projection=s.projection)

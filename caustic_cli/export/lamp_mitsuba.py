@@ -36,7 +36,7 @@ def plane_of(goal: Goal, radius: float) -> Goal:
     """The target, or the plane on which one in the far field is seen."""
     if not goal.far:
         return goal
-    width, height = (2.0 * DISTANT * radius * math.tan(math.radians(min(0.5 * s, WIDE))) for s in goal.size)
+    width, height = (2.0 * DISTANT * radius * math.tan(math.radians(min(0.5 * s, WIDE))) for s in goal.angles)
     return Goal((width, height), DISTANT * radius)
 
 

@@ -13,14 +13,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.scene import anglemap
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.rayset import RaySet
 
 SHAPES = ("point", "disc", "rectangle", "rays")
 #: Width of the classes of angles in which the intensity of a ray file is counted, degrees.
 CLASS = 5.0
-#: Widest target in the far field, degrees, along x and y: a lamp emits into z > 0.
-WIDEST = 178.0
+#: Points of a pixel along both axes at which its solid angle is taken, and pixels of that of a whole target.
+WITHIN, WHOLE = 3, (300, 300)
 #: Border of a target, a fraction of its smaller side, that is no part of its interior: least, and most where a chip blurs more.
 BORDERS = (0.025, 0.1)
 #: Largest ratio of its sides, and least distance of a plane target in radii of the lens.
@@ -88,18 +89,20 @@ class Chip:
 class Goal:
     """Where the light is wanted: a rectangle of a plane z = distance, or of angles in the far field, centred on the axis there.
 
-    Angles are those of type A photometry: along x the longitude about the y axis, atan2(x, z), along y the latitude, asin y.
+    In the far field x and y are those of a map of the directions, see `anglemap`.
 
     Raises:
         InputError: out of range.
     """
 
-    #: Full width and height, mm on the plane or degrees in the far field.
+    #: Full width and height, mm on the plane or degrees of the map in the far field.
     size: tuple[float, float]
     #: Of the plane, mm; inf for the far field.
     distance: float = math.inf
     #: Of its centre on the plane, from the axis, mm; 0 in the far field.
     shift: tuple[float, float] = (0.0, 0.0)
+    #: Of the directions in the far field, one of `anglemap.MAPS`.
+    projection: str = "latitude"
 
     def __post_init__(self):
         if not all(0 < s < math.inf for s in self.size):
@@ -114,26 +117,68 @@ class Goal:
             raise InputError(f"the shift of a target must be finite, got {self.shift}")
         if self.far and self.shift != (0.0, 0.0):
             raise InputError(f"a target in the far field is centred on the axis, got a shift of {self.shift}")
-        if self.far and max(self.size) > WIDEST:
-            raise InputError(f"a target in the far field is at most {WIDEST:g} degrees wide and high, got {self.size}")
+        if self.projection not in anglemap.MAPS or (self.projection != "latitude" and not self.far):
+            raise InputError(
+                f"the projection of a target in the far field is one of {', '.join(anglemap.MAPS)}, and of a plane there is none"
+            )
+        if self.far and not max(self.angles) <= (widest := anglemap.widest_of(self.projection)) + 1e-9:
+            raise InputError(
+                f"a target in the far field is at most {widest:g} degrees wide and high, got {self.angles[0]:g} x"
+                f" {self.angles[1]:g}"
+            )
 
     @property
     def far(self) -> bool:
         """Whether it is in the far field."""
         return math.isinf(self.distance)
 
+    @property
+    def by_latitude(self) -> bool:
+        """Whether it is in the far field, and along y is the latitude."""
+        return self.far and self.projection == "latitude"
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """Full angles about the axis of its width and height in the far field, degrees."""
+        width, height = (anglemap.angle_of(self.projection, s) for s in self.size)
+        return width, height
+
+    @property
+    def solid_angle(self) -> float:
+        """Of a target in the far field, sr."""
+        return float(self._solid_angles(WHOLE).sum())
+
+    def _solid_angles(self, pixels: tuple[int, int]) -> np.ndarray:
+        """Of each pixel in the far field, (n_x, n_y), sr: exact by latitude, else by WITHIN^2 points of each."""
+        if self.projection == "latitude":
+            along = np.diff(np.sin(np.radians(self.size[1] * (np.arange(pixels[1] + 1) / pixels[1] - 0.5))))
+            return np.outer(np.full(pixels[0], math.radians(self.size[0]) / pixels[0]), along)
+        x, y = np.meshgrid(*self._centres((WITHIN * pixels[0], WITHIN * pixels[1])), indexing="ij")
+        found = anglemap.solid_angles_at(self.projection, x, y).reshape(pixels[0], WITHIN, pixels[1], WITHIN).mean((1, 3))
+        return found * math.prod(self.size) / math.prod(pixels)
+
+    def _centres(self, pixels: tuple[int, int]) -> list[np.ndarray]:
+        """Coordinates of the centres of pixels from that of the target, (n_x,) and (n_y,), mm or degrees."""
+        return [((np.arange(n) + 0.5) / n - 0.5) * s for n, s in zip(pixels, self.size, strict=True)]
+
+    def directions(self, pixels: tuple[int, int]) -> np.ndarray:
+        """Unit directions from the origin to the centres of pixels, (n_x n_y, 3)."""
+        x, y = (c.reshape(-1) for c in np.meshgrid(*self._centres(pixels), indexing="ij"))
+        if self.far:
+            return anglemap.directions_at(self.projection, x, y)
+        found = np.stack([x + self.shift[0], y + self.shift[1], np.full_like(x, self.distance)], 1)
+        return found / np.linalg.norm(found, axis=1, keepdims=True)
+
     def shares(self, pixels: tuple[int, int]) -> np.ndarray:
         """Part of each pixel in the area of a plane target, or in the solid angle of one in the far field: (n_x, n_y), of sum 1."""
-        across, along = np.ones(pixels[0]), np.ones(pixels[1])
-        if self.far:
-            along = np.diff(np.sin(np.radians(self.size[1] * (np.arange(pixels[1] + 1) / pixels[1] - 0.5))))
-        return np.outer(across / across.sum(), along / along.sum())
+        found = self._solid_angles(pixels) if self.far else np.ones(pixels)
+        return found / found.sum()
 
     @property
     def nearest_edge(self) -> float:
         """Angle from the axis of the middle of the nearest edge, degrees; negative if the axis misses the target."""
         if self.far:
-            return min(self.size) / 2
+            return min(self.angles) / 2
         reach = min(s / 2 - abs(c) for c, s in zip(self.shift, self.size, strict=True))
         return math.degrees(math.atan(reach / self.distance))
 

@@ -312,9 +312,12 @@ class LampSettings(Section):
             option=Option("--chip-intensity", "FILE"), file="chip")
     file: str | None = setting("ray file (TM-25 and others, as of a source) of the chip instead, in the frame of the lamp",
             derived="a chip by its size", option=Option("--chip-rays", "FILE"), file="chip-rays")
-    angles: Pair | None = setting("full width and height of the picture in the far field, its values being intensities: longitude"
-            " about the vertical and latitude (type A photometry)", "degrees", 0.0, 178.0, above=True, derived="a picture on a"
-            " screen", option=Option("--angles", "W[xH]"))
+    angles: Pair | None = setting("full width and height of the picture in the far field, its values being intensities", "degrees",
+            0.0, 178.0, above=True, derived="a picture on a screen", option=Option("--angles", "W[xH]"))
+    projection: str = setting("coordinates of the picture in the far field: longitude about the vertical and latitude (type A"
+            " photometry); gnomonic, as on a plane; stereographic; or polar, the angle gamma towards C (type C photometry)",
+            choices=("latitude", "gnomonic", "stereographic", "polar"), default="latitude", written=False,
+            option=Option("--projection", "latitude|gnomonic|stereographic|polar"))
 
 
 class LensSettings(Section):

@@ -80,7 +80,7 @@ def lamp_image(
         image, outside = splat(x, y, arriving, screens[0], Filter())
         halves[half] += image
         fewer += 0.5 * splat(x, y, arriving, screens[1], Filter())[0]
-        if goal.far:
+        if goal.by_latitude:
             near = torch.where(x.abs() <= STRIP, 0.5 * arriving, torch.zeros_like(x))
             rise += torch.bincount(((y + 90.0) / STEP).long(), near, len(rise))
         for cause, power in light.lost.items():
@@ -175,9 +175,10 @@ def lamp_figures(
         "interior_noise": interior[1],
         "uniformity": uniformity,
         "border": lamp.border(goal),
+        "border_unit": goal.unit,
         "uncoated_limit": lamp.uncoated_limit,
         "lost": found.lost,
-        **({"cut_off": cut_off(found.rise)} if goal.far else {}),
+        **({"cut_off": cut_off(found.rise)} if goal.by_latitude else {}),
         "least_wall": least_wall(lamp, field, values),
         "greatest_radius": field.extent(sides(values)[1])[1],
         "pixels": list(pixels),

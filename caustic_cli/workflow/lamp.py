@@ -355,7 +355,7 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         (
             "relative RMS error",
             f"{number('interior_rms', '.4f')}, noise {number('interior_noise', '.2g')}; with the outer"
-            f" {number('border', '.4g')} {'degrees' if 'cut_off' in figures else 'mm'}"
+            f" {number('border', '.4g')} {figures.get('border_unit', 'mm')}"
             f" {number('relative_rms', '.4f')}, noise {number('noise', '.2g')}",
         ),
         ("least over mean", number("uniformity", ".3f")),
