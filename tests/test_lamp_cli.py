@@ -289,10 +289,10 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (["render", "--effects", "none"], "--effects is for a lens before its light"),
+        (["render", "--effects", "absorption"], "--effects of a lamp must be none, auto or ghosts"),
         (["render", "--screen-at", "100"], "--screen-at is for a lens before its light"),
         (["render", "--source", "disc"], "--source is for a lens before its light"),
-        (["render", "--explain"], "--explain is for a lens before its light"),
+        (["render", "--html", "a.html"], "--html is for a lens before its light"),
         (["render", "--verify", "mitsuba"], "not installed"),
         (["export"], "a --format is needed"),
         (["export", "-o", "a.dat"], "a --format is needed"),

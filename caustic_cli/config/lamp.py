@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +28,11 @@ from caustic_cli.schema.table import (
 #: Radius of the hemisphere over that of the lens by the number of free-form surfaces, unless given; and the material, of which
 #: lamps are moulded.
 INNER, MATERIAL = {1: 4.0 / 15.0, 2: 2.0 / 15.0}, "PMMA"
+#: Thickness of the board of an array, mm.
+BOARD = 2.0
 #: The settings of other sections that a lamp has; parameters have no section.
 TAKEN = {
-    "lens": ("index", "glass", "wavelength"),
+    "lens": ("index", "glass", "wavelength", "array"),
     "screen": ("z", "shift"),
     "target": ("file", "size", "encoding", "flip"),
     "design": ("seed", "start"),
@@ -64,9 +68,15 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
     extent = ["chip"] if any(lamp.chip) else []
     if "file" in lamp and (others := [*extent, *(key for key in ("shape", "intensity") if key in lamp)]):
         raise InputError(f"⟨lamp.file⟩ holds where and how the chip emits: leave out ⟨lamp.{others[0]}⟩")
-    lamp = lamp.filled(inner=INNER[lamp.surfaces] * lamp.radius)
+    radius = lamp.radius
+    lamp = lamp.filled(inner=INNER[lamp.surfaces] * radius)
     lens = LensSettings(given.get("lens", {}))
     lens = lens if {"index", "glass"} & {*lens} else lens.filled(glass=MATERIAL)
+    check_all("lens", lens, *({"array"} & {*lens}))
+    if math.prod(lens.array) > 1:
+        lamp = lamp.filled(base=BOARD, pitch=(2.0 * (radius + lamp.wall),) * 2)
+    elif "pitch" in lamp:
+        raise InputError("⟨lamp.pitch⟩ belongs to an array of lamps, which ⟨+lens.array⟩ makes")
     target, screen = TargetSettings(given.get("target", {})), ScreenSettings()
     far = by.get("screen_place")
     if far not in (None, "far"):
@@ -125,10 +135,13 @@ def lamp_of(settings: Settings) -> Lamp:
     assert s is not None and s.radius is not None and s.inner is not None
     table, rays = (getattr(file, "content", None) for file in (s.intensity, s.file))
     if rays is not None:
-        chip = Chip.of_rays(rays)
+        chip = replace(Chip.of_rays(rays), reflectance=s.reflectance)
     else:
-        chip = Chip(intensity=table) if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip, table)
-    return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall, s.surfaces, s.base, s.flange)
+        shape = "point" if s.chip == (0.0, 0.0) else s.shape
+        chip = Chip(shape, s.chip, table, reflectance=s.reflectance)
+    pitch = s.pitch if "pitch" in s else (0.0, 0.0)
+    solid = s.inner, s.radius, s.wall, s.surfaces, s.base, s.flange
+    return Lamp(chip, index_of(settings.lens), *solid, settings.lens.array, pitch, ghosts=s.reflectance > 0)
 
 
 def goal_of(settings: Settings) -> Goal:

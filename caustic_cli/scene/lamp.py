@@ -24,6 +24,8 @@ CLASS = 5.0
 WITHIN, WHOLE = 3, (300, 300)
 #: Border of a target, a fraction of its smaller side, that is no part of its interior: least, and most where a chip blurs more.
 BORDERS = (0.025, 0.1)
+#: Most lamps of an array.
+MOST_LAMPS = 400
 #: Largest ratio of its sides, and least distance of a plane target in radii of the lens.
 OBLONG, NEAREST = 100.0, 2.0
 
@@ -44,6 +46,8 @@ class Chip:
     intensity: Distribution | None = None
     #: Of a ray file, in the frame of the lamp.
     rays: RaySet | None = None
+    #: Part of the light that comes back to it which it reflects, diffusely.
+    reflectance: float = 0.0
 
     @classmethod
     def of_rays(cls, rays: RaySet) -> Chip:
@@ -63,6 +67,8 @@ class Chip:
     def __post_init__(self):
         if self.shape not in SHAPES or (self.shape == "rays") != (self.rays is not None):
             raise InputError(f"the shape of a chip must be one of {', '.join(SHAPES[:3])}, got {self.shape!r}")
+        if not 0 <= self.reflectance <= 1:
+            raise InputError(f"the reflectance of a chip must be 0 to 1, got {self.reflectance!r}")
         if self.rays is not None:
             return
         if not all(math.isfinite(s) and s >= 0 for s in self.size):
@@ -209,8 +215,20 @@ class Lamp:
     #: Thickness of the foot below the plane of the chip, and width of its flange beyond the rim of the lens, mm.
     base: float = 0.0
     flange: float = 0.0
+    #: Lamps of an array along x and y, each with its chip, and their distances, mm: one part on a board, which the foot is.
+    array: tuple[int, int] = (1, 1)
+    pitch: tuple[float, float] = (0.0, 0.0)
+    #: Whether light that is reflected within the lens is followed (`optics.lamp_ghosts`) instead of booked as lost.
+    ghosts: bool = False
 
     def __post_init__(self):
+        if not (min(self.array) >= 1 and self.count <= MOST_LAMPS):
+            raise InputError(f"⟨lens.array⟩ of a lamp holds 1 to {MOST_LAMPS} lamps, got {self.array[0]} x {self.array[1]}")
+        if self.count > 1 and not (self.base > 0 and all(2.0 * self.radius < p < math.inf for p in self.pitch)):
+            raise InputError(
+                f"⟨lamp.pitch⟩ must be greater than twice ⟨+lamp.radius⟩, {2.0 * self.radius:g} mm, and ⟨+lamp.base⟩, the board"
+                f" that holds an array, greater than 0 mm, got {self.pitch[0]:g} x {self.pitch[1]:g} and {self.base:g} mm"
+            )
         if self.surfaces not in (1, 2):
             raise InputError(f"a lamp has 1 or 2 free-form surfaces, got {self.surfaces!r}")
         if not 1.0 < self.index <= 5.0:
@@ -229,6 +247,23 @@ class Lamp:
                 f"⟨lamp.radius⟩ must be greater than ⟨+lamp.inner⟩ and ⟨+lamp.wall⟩ together, {self.inner + self.wall:g} mm, got"
                 f" {self.radius:g} mm"
             )
+
+    @property
+    def count(self) -> int:
+        """Number of lamps."""
+        return math.prod(self.array)
+
+    @property
+    def places(self) -> np.ndarray:
+        """Centres of the chips (count, 2), mm, y varying fastest; their mean is the origin."""
+        x, y = (p * (np.arange(n) - 0.5 * (n - 1)) for n, p in zip(self.array, self.pitch, strict=True))
+        return np.stack([c.reshape(-1) for c in np.meshgrid(x, y, indexing="ij")], 1)
+
+    @property
+    def board(self) -> tuple[float, float]:
+        """Half width and height of the board of an array, mm: a cell of the lattice for each lamp, and the flange around."""
+        x, y = (0.5 * n * p + self.flange for n, p in zip(self.array, self.pitch, strict=True))
+        return x, y
 
     def blur(self, goal: Goal) -> float:
         """Full width of a point of the picture, mm or degrees: the chip as seen from the greatest radius of the lens, on the

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -60,10 +61,11 @@ def _mitsuba(path: Path, found: Exported, samples: Samples) -> None:
 
 
 def _photometry(write: Callable[[Path, Photometry], None], path: Path, found: Exported, _: Samples) -> dict[str, Any]:
-    """flux, lm per 1000 lm of the chip, and peak_candela."""
+    """flux, lm per 1000 lm of the chips, and peak_candela; the file of an array holds the light of as many chips of 1000 lm."""
     table = intensity_table(found.lamp, found.field, found.values, rays=current_effort().final_rays, seed=found.seed)
-    greatest, name = found.field.extent(sides(found.values)[1])[1], found.name
-    write(path, Photometry(table.planes, table.angles, table.values, FLUX, name, 2.0 * greatest, greatest))
+    greatest, name, count = found.field.extent(sides(found.values)[1])[1], found.name, found.lamp.count
+    across = 2.0 * (greatest + math.hypot(*found.lamp.places.max(0)))
+    write(path, Photometry(table.planes, table.angles, count * table.values, count * FLUX, name, across, greatest))
     return {"flux": table.flux, "peak_candela": table.peak}
 
 
