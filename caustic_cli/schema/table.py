@@ -357,6 +357,8 @@ class LensSettings(Section):
             default=0.0, written=False, option=Option("--roughness", "SLOPE", BOTH))
     mirror: bool = setting("the surface is a mirror, with the screen on the source's side, beside its light", default=False,
             written=False, option=Option("--mirror"))
+    crossing: bool = setting("the light crosses over on its way to the screen: a surface that is convex where the other one,"
+            " without it, is concave, or less convex", default=False, written=False, option=Option("--crossing"))
     aperture: str = setting("shape of the lens: rectangle, or circle, the largest within size", choices=("rectangle", "circle"),
             default="rectangle", written=False, option=Option("--aperture", "rectangle|circle"))
     border: float = setting("width of a mounting rim around the aperture in exported solids", "mm", 0.0, 1e6, default=0.0,

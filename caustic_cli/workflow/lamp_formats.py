@@ -79,6 +79,13 @@ FORMATS = {
     "ies": Format(".ies", partial(_photometry, write_ies), False),
     "ldt": Format(".ldt", partial(_photometry, write_ldt), False),
 }
+#: What formats hold that have no lamp.
+HOLDS = {
+    "zemax": "a grid of sags over x and y (Grid Sag)",
+    "lighttools": "the points of a surface over x and y",
+    "gcode": "the path of a tool above a height at each x and y",
+    "phase": "the phase of a thin element at each x and y",
+}
 
 
 def check_export(format: str, samples: Samples | None) -> None:
@@ -88,9 +95,10 @@ def check_export(format: str, samples: Samples | None) -> None:
         InputError: as it says.
     """
     if format not in FORMATS:
+        what = HOLDS.get(format, "a height at each x and y")
         raise InputError(
-            f"⟨format⟩ {format} holds height fields, and a lamp's surface is none; {', '.join(FORMATS)} hold the lamp or its light,"
-            " step for programs of optical design as well"
+            f"⟨format⟩ {format} holds {what}, and a lamp's surface is none of that: it has two sides and may overhang;"
+            f" {', '.join(FORMATS)} hold the lamp or its light, step as a solid for LightTools and OpticStudio, too"
         )
     if samples is not None and not FORMATS[format].sampled:
         raise InputError(f"⟨samples⟩ belongs to {', '.join(name for name in FORMATS if FORMATS[name].sampled)}, got {format}")
