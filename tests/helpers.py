@@ -1,5 +1,7 @@
 """What tests share: the picture they design for, a design that ends where it begins, and fewer combinations."""
 
+import ast
+import re
 from collections.abc import Sequence
 from itertools import combinations, product
 from types import SimpleNamespace
@@ -48,3 +50,67 @@ def pairwise(*lists: Sequence) -> list[tuple]:
 def looked_up_in(profile):
     """A profile (a, b), constant per cell, as the function of u and v that a sampler takes."""
     return lambda u, v: looked_up(profile.numpy(), 2.0 * u - 1.0, 2.0 * v - 1.0)
+
+
+# STEP
+
+
+def read_step(path):
+    """Entities by number, as text: enough of ISO 10303-21 for a test."""
+    text = path.read_text()
+    assert text.startswith("ISO-10303-21;\nHEADER;") and text.endswith("ENDSEC;\nEND-ISO-10303-21;\n")
+    return {int(n): body for n, body in re.findall(r"^#(\d+)=(.*);$", text, re.M)}
+
+
+def arguments(body):
+    """The arguments of an entity as nested tuples of numbers, references and words."""
+    text = re.sub(r"\.(\w+)\.", r"'\1'", body[body.index("(") :])
+    text = re.sub(r"#(\d+)", r"'#\1'", text.replace("$", "None").replace("*", "None"))
+    return ast.literal_eval(text.replace(")", ",)").replace("(,)", "()").replace(",,)", ",)"))
+
+
+def edges_of(entities):
+    """The number of edges of a closed shell: each is used once each way, and the corners of every loop follow one another."""
+    assert {int(r) for body in entities.values() for r in re.findall(r"#(\d+)", body)} <= set(entities)
+    uses = []
+    for loop in (arguments(b)[1] for b in entities.values() if b.startswith("EDGE_LOOP")):
+        ends = []
+        for oriented in loop:
+            *_, edge, way = arguments(entities[int(oriented[1:])])
+            _, a, b, _, _ = arguments(entities[int(edge[1:])])
+            uses.append((edge, way))
+            ends.append((a, b) if way == "T" else (b, a))
+        assert all(e[1] == n[0] for e, n in zip(ends, ends[1:] + ends[:1], strict=True))
+    edges = {edge for edge, _ in uses}
+    assert len(uses) == len(set(uses)) == 2 * len(edges)
+    return len(edges)
+
+
+def step_in_opencascade(path):
+    """The surfaces of the faces of a valid solid, and a function that returns its volume, where cadquery-ocp is installed."""
+    from OCP.BRep import BRep_Tool  # noqa: PLC0415
+    from OCP.BRepCheck import BRepCheck_Analyzer  # noqa: PLC0415
+    from OCP.BRepGProp import BRepGProp  # noqa: PLC0415
+    from OCP.GProp import GProp_GProps  # noqa: PLC0415
+    from OCP.STEPControl import STEPControl_Reader  # noqa: PLC0415
+    from OCP.TopAbs import TopAbs_FACE, TopAbs_ShapeEnum  # noqa: PLC0415
+    from OCP.TopExp import TopExp_Explorer  # noqa: PLC0415
+    from OCP.TopoDS import TopoDS  # noqa: PLC0415
+
+    reader = STEPControl_Reader()
+    reader.ReadFile(str(path))
+    reader.TransferRoots()
+    shape = reader.OneShape()
+    assert BRepCheck_Analyzer(shape).IsValid() and shape.ShapeType() == TopAbs_ShapeEnum.TopAbs_SOLID
+    explorer, surfaces = TopExp_Explorer(shape, TopAbs_FACE), []
+    while explorer.More():
+        face = getattr(TopoDS, "Face_s", None) or TopoDS.Face
+        surfaces.append(BRep_Tool.Surface_s(face(explorer.Current())))
+        explorer.Next()
+
+    def volume():
+        found = GProp_GProps()
+        BRepGProp.VolumePropertiesGK_s(shape, found, 1e-6)
+        return found.Mass()
+
+    return surfaces, volume

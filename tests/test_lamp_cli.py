@@ -289,17 +289,17 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (["render", "--effects", "none"], "--effects is for a lens before its light"),
+        (["render", "--effects", "absorption"], "--effects of a lamp must be none, auto or ghosts"),
         (["render", "--screen-at", "100"], "--screen-at is for a lens before its light"),
         (["render", "--source", "disc"], "--source is for a lens before its light"),
-        (["render", "--explain"], "--explain is for a lens before its light"),
+        (["render", "--html", "a.html"], "--html is for a lens before its light"),
         (["render", "--verify", "mitsuba"], "not installed"),
         (["export"], "a --format is needed"),
         (["export", "-o", "a.dat"], "a --format is needed"),
-        (["export", "--format", "heightmap"], "a lamp's surface is none"),
-        (["export", "--format", "zemax"], "step for programs of optical design"),
+        (["export", "--format", "heightmap"], "a lamp's surface is none of that"),
+        (["export", "--format", "zemax"], "step as a solid for LightTools and OpticStudio"),
         (["export", "--format", "step", "--samples", "9"], "--samples belongs to stl, ply, obj, 3mf"),
-        (["export", "--format", "gcode"], "a lamp's surface is none"),
+        (["export", "--format", "gcode"], "a lamp's surface is none of that"),
         (["export", "--format", "stl", "--mould"], "--mould is for a lens before its light"),
         (["export", "--format", "ies", "--samples", "9"], "--samples belongs to stl, ply, obj, 3mf"),
         (["export", "--format", "stl", "--samples", "1"], "2 to 4000 rings"),
@@ -318,7 +318,7 @@ def test_what_a_lamp_has_not_is_refused_in_one_line(command, words, road, capfd,
 
 def test_of_several_formats_none_is_written_where_one_is_refused(road, capfd):
     before = set(Path().iterdir())
-    assert "a lamp's surface is none" in refused(capfd, "export", str(road), "--format", "ldt,gcode")
+    assert "a lamp's surface is none of that" in refused(capfd, "export", str(road), "--format", "ldt,gcode")
     assert set(Path().iterdir()) == before
 
 

@@ -13,9 +13,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from helpers import arguments, edges_of, read_step, step_in_opencascade
 from rayfiles import zemax
 from scipy.interpolate import BSpline
-from test_roundtrip import arguments, read_step
 
 from caustic_cli import cli
 from caustic_cli.errors import InputError
@@ -119,49 +119,21 @@ def test_a_step_file_is_a_closed_shell(case, tmp_path):
     lamp, values, faces, edges = CASES[case]
     write_lamp_step(tmp_path / "a.step", lamp, FIELD, values)
     entities = read_step(tmp_path / "a.step")
-    assert {int(r) for body in entities.values() for r in re.findall(r"#(\d+)", body)} <= set(entities)
-    uses = []
-    for loop in (arguments(b)[1] for b in entities.values() if b.startswith("EDGE_LOOP")):
-        ends = []
-        for oriented in loop:
-            *_, edge, way = arguments(entities[int(oriented[1:])])
-            _, a, b, _, _ = arguments(entities[int(edge[1:])])
-            uses.append((edge, way))
-            ends.append((a, b) if way == "T" else (b, a))
-        assert all(e[1] == n[0] for e, n in zip(ends, ends[1:] + ends[:1], strict=True))
-    assert len(uses) == len(set(uses)) == 2 * edges and len({e for e, _ in uses}) == edges
+    assert edges_of(entities) == edges
     assert sum(b.startswith("ADVANCED_FACE") for b in entities.values()) == faces
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_step_in_opencascade(case, tmp_path):
     """Only where OpenCASCADE (cadquery-ocp) is installed: a valid solid, its volume, and its points."""
-    control = pytest.importorskip("OCP.STEPControl", exc_type=ImportError)
-    from OCP.BRep import BRep_Tool  # noqa: PLC0415
-    from OCP.BRepCheck import BRepCheck_Analyzer  # noqa: PLC0415
-    from OCP.BRepGProp import BRepGProp  # noqa: PLC0415
+    pytest.importorskip("OCP.STEPControl", exc_type=ImportError)
     from OCP.Geom import Geom_BSplineSurface  # noqa: PLC0415
-    from OCP.GProp import GProp_GProps  # noqa: PLC0415
-    from OCP.TopAbs import TopAbs_FACE, TopAbs_ShapeEnum  # noqa: PLC0415
-    from OCP.TopExp import TopExp_Explorer  # noqa: PLC0415
-    from OCP.TopoDS import TopoDS  # noqa: PLC0415
 
     lamp, values, faces, _ = CASES[case]
     write_lamp_step(tmp_path / "a.step", lamp, FIELD, values)
-    reader = control.STEPControl_Reader()
-    reader.ReadFile(str(tmp_path / "a.step"))
-    reader.TransferRoots()
-    shape = reader.OneShape()
-    assert BRepCheck_Analyzer(shape).IsValid() and shape.ShapeType() == TopAbs_ShapeEnum.TopAbs_SOLID
-    explorer, surfaces = TopExp_Explorer(shape, TopAbs_FACE), []
-    while explorer.More():
-        face = getattr(TopoDS, "Face_s", None) or TopoDS.Face
-        surfaces.append(BRep_Tool.Surface_s(face(explorer.Current())))
-        explorer.Next()
+    surfaces, mass = step_in_opencascade(tmp_path / "a.step")
     assert len(surfaces) == faces
-    found = GProp_GProps()
-    BRepGProp.VolumePropertiesGK_s(shape, found, 1e-6)
-    assert found.Mass() == pytest.approx(volume(*lamp_mesh(lamp, FIELD, values, (200, 800))), rel=1e-4)
+    assert mass() == pytest.approx(volume(*lamp_mesh(lamp, FIELD, values, (200, 800))), rel=1e-4)
     outer, inner = [s for s in surfaces if isinstance(s, Geom_BSplineSurface)]
     u, v = random_directions(300)
     nets = (values, FIELD.sphere(lamp.inner)) if values.ndim == 2 else (values[1], values[0])
@@ -322,7 +294,7 @@ def test_the_light_of_a_tabulated_chip_has_its_intensity(size):
     assert cosine == pytest.approx(wanted, abs=1e-3)
     directions, power = source_directions(60, chip)
     assert float((power * directions[:, 2]).sum()) == pytest.approx(wanted, abs=3e-3)
-    origin, direction = lamp_verify._emitted(chip, 40_000, np.random.default_rng(1))
+    origin, direction = lamp_verify._of_chip(chip, 40_000, np.random.default_rng(1))
     assert direction[2].mean() == pytest.approx(wanted, abs=5e-3) and origin.shape == (3, 40_000)
 
 

@@ -111,6 +111,16 @@ def test_another_program_reads_and_writes_the_same():
         np.testing.assert_allclose(read_photometry(Path(f"{symmetry}.ldt")).values, light_of(intensity).values, atol=0.2)
 
 
+def test_another_program_reads_the_same_of_lm_63():
+    """Only where eulumdat-ies is installed: in candela per 1000 lm, over C 0 to 345 and gamma."""
+    reader = pytest.importorskip("eulumdat_ies", exc_type=ImportError)
+    light = light_of(lopsided)._replace(lumens=2500.0)
+    write_ies(Path("a.ies"), light)
+    read = reader.ies_to_ldt(Path("a.ies"))
+    np.testing.assert_allclose(np.array(read.intensities) * 2.5, light.values, rtol=1e-6, atol=1e-5)
+    assert read.header.g_angles == ANGLES.tolist() and read.header.lamp_flux == [2500.0]
+
+
 # Targets
 
 

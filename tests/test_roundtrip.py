@@ -7,7 +7,6 @@ f and g being its height and slopes; they must land where the program's own trac
 
 from __future__ import annotations
 
-import ast
 import math
 import re
 import sys
@@ -20,6 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from helpers import arguments, edges_of, read_step, step_in_opencascade
 from scipy.interpolate import BSpline, CubicHermiteSpline, RectBivariateSpline
 from test_export import CASES, make, signed_volume
 
@@ -275,20 +275,6 @@ def test_refuses_absurd_tolerances(tolerance, lens):
 # STEP
 
 
-def read_step(path):
-    """Entities by number, as text: enough of ISO 10303-21 for a test."""
-    text = path.read_text()
-    assert text.startswith("ISO-10303-21;\nHEADER;") and text.endswith("ENDSEC;\nEND-ISO-10303-21;\n")
-    return {int(n): body for n, body in re.findall(r"^#(\d+)=(.*);$", text, re.M)}
-
-
-def arguments(body):
-    """The arguments of an entity as nested tuples of numbers, references and words."""
-    text = re.sub(r"\.(\w+)\.", r"'\1'", body[body.index("(") :])
-    text = re.sub(r"#(\d+)", r"'#\1'", text.replace("$", "None").replace("*", "None"))
-    return ast.literal_eval(text.replace(")", ",)").replace("(,)", "()").replace(",,)", ",)"))
-
-
 def step_surface(entities):
     """Degrees, poles (n, m, 3), knot vectors."""
     (body,) = (b for b in entities.values() if b.startswith("B_SPLINE_SURFACE_WITH_KNOTS"))
@@ -417,57 +403,28 @@ def test_step_is_closed(tmp_path, case, outline):
     """Every edge is used once each way, every reference exists, and the corners of every loop follow one another."""
     write_step(tmp_path / "lens.step", *shaped(make(**case), *outline))
     entities = read_step(tmp_path / "lens.step")
-    assert {int(r) for body in entities.values() for r in re.findall(r"#(\d+)", body)} <= set(entities)
-    uses = []
-    loops = [arguments(b)[1] for b in entities.values() if b.startswith("EDGE_LOOP")]
     sides, border = (2, 4)[outline[0] == "rectangle"], outline[1] > 0
-    assert len(loops) == 2 + sides + border * (sides + 2)
-    for loop in loops:
-        ends = []
-        for oriented in loop:
-            *_, edge, way = arguments(entities[int(oriented[1:])])
-            _, a, b, _, _ = arguments(entities[int(edge[1:])])
-            uses.append((edge, way))
-            ends.append((a, b) if way == "T" else (b, a))
-        assert all(e[1] == n[0] for e, n in zip(ends, ends[1:] + ends[:1], strict=True))
-    edges = sides * (3 + 4 * border - border)
-    assert len(uses) == len(set(uses)) == 2 * edges and len({e for e, _ in uses}) == edges
+    assert sum(body.startswith("EDGE_LOOP") for body in entities.values()) == 2 + sides + border * (sides + 2)
+    assert edges_of(entities) == sides * (3 + 4 * border - border)
 
 
 def test_step_in_opencascade(tmp_path, lens, rays, capsys):
     """Only where OpenCASCADE (cadquery-ocp) is installed: a valid solid, poles to the last bit, the volume, the rays."""
-    control = pytest.importorskip("OCP.STEPControl", exc_type=ImportError)
-    from OCP.BRep import BRep_Tool  # noqa: PLC0415
-    from OCP.BRepCheck import BRepCheck_Analyzer  # noqa: PLC0415
-    from OCP.BRepGProp import BRepGProp  # noqa: PLC0415
+    pytest.importorskip("OCP.STEPControl", exc_type=ImportError)
     from OCP.Geom import Geom_BSplineSurface  # noqa: PLC0415
     from OCP.gp import gp_Pnt, gp_Vec  # noqa: PLC0415
-    from OCP.GProp import GProp_GProps  # noqa: PLC0415
-    from OCP.TopAbs import TopAbs_FACE, TopAbs_ShapeEnum  # noqa: PLC0415
-    from OCP.TopExp import TopExp_Explorer  # noqa: PLC0415
-    from OCP.TopoDS import TopoDS  # noqa: PLC0415
 
     cases = [shaped(make(**CASES["square"]), *outline) for outline in OUTLINES]
     for k, made in enumerate([*cases, *(make(**case) for case in CASES.values()), lens]):
         scene, field, heights = made
         path = tmp_path / f"{k}.step"
         write_step(path, *made, tolerance=0.0)
-        reader = control.STEPControl_Reader()
-        reader.ReadFile(str(path))
-        reader.TransferRoots()
-        shape = reader.OneShape()
-        assert BRepCheck_Analyzer(shape).IsValid() and shape.ShapeType() == TopAbs_ShapeEnum.TopAbs_SOLID
-        explorer, surfaces = TopExp_Explorer(shape, TopAbs_FACE), []
-        while explorer.More():
-            face = getattr(TopoDS, "Face_s", None) or TopoDS.Face
-            surfaces.append(BRep_Tool.Surface_s(face(explorer.Current())))
-            explorer.Next()
+        surfaces, volume = step_in_opencascade(path)
         (surface,) = (s for s in surfaces if isinstance(s, Geom_BSplineSurface))
         assert len(surfaces) == [6, 11, 4, 7, *[6] * 9][k]
         if k < len(cases):
-            found, (vertices, faces) = GProp_GProps(), closed_mesh(*made, samples=(201, 201))
-            BRepGProp.VolumePropertiesGK_s(shape, found, 1e-6)
-            assert found.Mass() == pytest.approx(signed_volume(vertices[faces]), rel=3e-5)
+            vertices, faces = closed_mesh(*made, samples=(201, 201))
+            assert volume() == pytest.approx(signed_volume(vertices[faces]), rel=3e-5)
         net = np.array([[surface.Pole(i + 1, j + 1).Z() for j in range(field.shape[1])] for i in range(field.shape[0])])
         assert (net == heights.numpy()).all()
     found = []

@@ -34,7 +34,8 @@ class DesignOptions(options.Computation):
         typer.Argument(
             metavar="TARGET",
             help="The picture: an image file or a 2-D .npy of irradiance, - for standard input, or uniform, disc or headlamp where"
-            " there is no such file; of a lamp also the light of a photometric file, .ies or .ldt; with --resume, the project.",
+            " there is no such file; of a lamp also road, for equal luminance of a road to a driver, or the light of a photometric"
+            " file, .ies or .ldt; with --resume, the project.",
             show_default=False,
         ),
     ]
@@ -199,7 +200,7 @@ def _check_new(asked: DesignOptions) -> Any:
     from caustic_cli.config.values import refuse_bad_file, refuse_bad_options  # noqa: PLC0415
     from caustic_cli.io.files import read_stdin  # noqa: PLC0415
     from caustic_cli.io.photometry import SUFFIXES, read_photometry  # noqa: PLC0415
-    from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, read_picture  # noqa: PLC0415
+    from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, is_road, read_picture  # noqa: PLC0415
 
     given, target = asked.given, asked.target
     if (target / "project.toml").is_file():
@@ -214,7 +215,7 @@ def _check_new(asked: DesignOptions) -> Any:
     picture = read_stdin(ACCEPTED, MAX_BYTES) if str(target) == "-" else target
     if target.suffix.lower() in SUFFIXES:
         read_photometry(target)
-    elif asked.config is None:  # a configuration may set its encoding
+    elif asked.config is None and not is_road(picture):  # a configuration may set its encoding
         read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
     return picture
 

@@ -540,7 +540,7 @@ def refuse_others(asked: Given, taken: Sequence[str]) -> None:
         if name not in {*common, *taken, "given", "project", "say"} and value not in (getattr(type(asked), name, None), {}):
             names.append(f"--{name.replace('_', '-')}")
     if names:
-        raise InputError(f"{names[0]} is for a lens before its light; of a lamp (--lamp) it has no meaning")
+        raise InputError(f"{names[0]} is for a lens before its light, and not available for a lamp around it (--lamp)")
 
 
 def require_project(path: Path, archives: bool = False) -> None:

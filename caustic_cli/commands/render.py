@@ -229,7 +229,7 @@ def _refuse_disagreement(asked: RenderOptions, figures: dict[str, Any]) -> None:
 
 
 #: Options that apply to lamps.
-OF_LAMPS = ("rays", "output", "npy", "verify", "report")
+OF_LAMPS = ("rays", "output", "npy", "verify", "report", "effects", "explain")
 
 
 def _render_lamp(asked: RenderOptions, rays: int | None) -> None:
@@ -246,8 +246,11 @@ def _render_lamp(asked: RenderOptions, rays: int | None) -> None:
     if asked.verify and (why := verify.not_installed()):
         raise InputError(why)
     where = (asked.output, asked.npy, asked.force, asked.say, asked.verify is not None, asked.report)
-    figures = lamp.render(Project.open(asked.project), rays, asked.seed, *where)
+    project = Project.open(asked.project)
+    figures = lamp.render(project, rays, asked.seed, *where, effects=asked.effects)
     asked.say.table(str(asked.project), lamp.rows(figures))
+    if asked.explain:
+        asked.say.table("effects", lamp.effects_of(project, asked.effects, figures))
     if asked.verify:
         asked.say.table("Mitsuba", verify.rows(figures["verify"]))
     if asked.json:

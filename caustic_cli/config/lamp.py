@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from caustic_cli.config import presets
 from caustic_cli.config.settings import Given, Settings, index_of, read
 from caustic_cli.errors import InputError
+from caustic_cli.scene import anglemap
 from caustic_cli.scene.lamp import NEAREST, Chip, Goal, Lamp
 from caustic_cli.schema.table import (
     DesignSettings,
@@ -25,9 +28,11 @@ from caustic_cli.schema.table import (
 #: Radius of the hemisphere over that of the lens by the number of free-form surfaces, unless given; and the material, of which
 #: lamps are moulded.
 INNER, MATERIAL = {1: 4.0 / 15.0, 2: 2.0 / 15.0}, "PMMA"
+#: Thickness of the board of an array, mm.
+BOARD = 2.0
 #: The settings of other sections that a lamp has; parameters have no section.
 TAKEN = {
-    "lens": ("index", "glass", "wavelength"),
+    "lens": ("index", "glass", "wavelength", "array"),
     "screen": ("z", "shift"),
     "target": ("file", "size", "encoding", "flip"),
     "design": ("seed", "start"),
@@ -63,14 +68,22 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
     extent = ["chip"] if any(lamp.chip) else []
     if "file" in lamp and (others := [*extent, *(key for key in ("shape", "intensity") if key in lamp)]):
         raise InputError(f"⟨lamp.file⟩ holds where and how the chip emits: leave out ⟨lamp.{others[0]}⟩")
-    lamp = lamp.filled(inner=INNER[lamp.surfaces] * lamp.radius)
+    radius = lamp.radius
+    lamp = lamp.filled(inner=INNER[lamp.surfaces] * radius)
     lens = LensSettings(given.get("lens", {}))
     lens = lens if {"index", "glass"} & {*lens} else lens.filled(glass=MATERIAL)
+    check_all("lens", lens, *({"array"} & {*lens}))
+    if math.prod(lens.array) > 1:
+        lamp = lamp.filled(base=BOARD, pitch=(2.0 * (radius + lamp.wall),) * 2)
+    elif "pitch" in lamp:
+        raise InputError("⟨lamp.pitch⟩ belongs to an array of lamps, which ⟨+lens.array⟩ makes")
     target, screen = TargetSettings(given.get("target", {})), ScreenSettings()
     far = by.get("screen_place")
     if far not in (None, "far"):
         raise InputError(f"⟨screen_place⟩ of a lamp must be far, or be left out for a screen at ⟨+throw⟩, got {far}")
     if lamp.angles is None:
+        if "projection" in lamp:
+            raise InputError("⟨lamp.projection⟩ belongs to the far field, which ⟨+lamp.angles⟩ makes")
         if far:
             raise InputError("⟨screen_place⟩ far needs ⟨+lamp.angles⟩, the size of the picture in degrees")
         if "picture_size" not in by and "size" not in target:
@@ -122,10 +135,13 @@ def lamp_of(settings: Settings) -> Lamp:
     assert s is not None and s.radius is not None and s.inner is not None
     table, rays = (getattr(file, "content", None) for file in (s.intensity, s.file))
     if rays is not None:
-        chip = Chip.of_rays(rays)
+        chip = replace(Chip.of_rays(rays), reflectance=s.reflectance)
     else:
-        chip = Chip(intensity=table) if s.chip == (0.0, 0.0) else Chip(s.shape, s.chip, table)
-    return Lamp(chip, index_of(settings.lens), s.inner, s.radius, s.wall, s.surfaces, s.base, s.flange)
+        shape = "point" if s.chip == (0.0, 0.0) else s.shape
+        chip = Chip(shape, s.chip, table, reflectance=s.reflectance)
+    pitch = s.pitch if "pitch" in s else (0.0, 0.0)
+    solid = s.inner, s.radius, s.wall, s.surfaces, s.base, s.flange
+    return Lamp(chip, index_of(settings.lens), *solid, settings.lens.array, pitch, ghosts=s.reflectance > 0)
 
 
 def goal_of(settings: Settings) -> Goal:
@@ -137,4 +153,7 @@ def goal_of(settings: Settings) -> Goal:
     s = settings.lamp
     assert s is not None
     shift = settings.screen.shift
-    return Goal(settings.target.size, settings.screen.z, shift) if s.angles is None else Goal(s.angles)
+    if s.angles is None:
+        return Goal(settings.target.size, settings.screen.z, shift)
+    width, height = (anglemap.extent_of(s.projection, angle) for angle in s.angles)
+    return Goal((width, height), projection=s.projection)

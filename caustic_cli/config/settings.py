@@ -403,6 +403,7 @@ def build_lens(lens: LensSettings) -> Lens:
         lens.border,
         lens.array,
         gradient=build_gradient(lens),
+        crossing=lens.crossing,
     )
 
 
@@ -449,7 +450,10 @@ def build_scene(settings: Settings) -> Scene:
         InputError: a value is out of range, or it is a lamp, which has no height field.
     """
     if settings.lamp is not None:
-        raise InputError("⟨lamp.radius⟩ makes a lamp, a lens around its light, which caustic design, render and export alone take")
+        raise InputError(
+            "⟨lamp.radius⟩ makes a lamp, whose surface around its light is no height field over an aperture: caustic design, render"
+            " and export take it, and no other command"
+        )
     return Scene(
         build_source(settings.source),
         build_lens(settings.lens),

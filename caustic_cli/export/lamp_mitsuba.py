@@ -36,7 +36,7 @@ def plane_of(goal: Goal, radius: float) -> Goal:
     """The target, or the plane on which one in the far field is seen."""
     if not goal.far:
         return goal
-    width, height = (2.0 * DISTANT * radius * math.tan(math.radians(min(0.5 * s, WIDE))) for s in goal.size)
+    width, height = (2.0 * DISTANT * radius * math.tan(math.radians(min(0.5 * s, WIDE))) for s in goal.angles)
     return Goal((width, height), DISTANT * radius)
 
 
@@ -81,13 +81,16 @@ def write_lamp_mitsuba(
 
 
 def _chip(lamp: Lamp) -> list[str]:
-    """The emitter, of power 1."""
+    """The emitters, of power 1 together."""
     chip, point = lamp.chip, lamp.chip.shape == "point"
     (x, y), square = (2.0 * POINT * lamp.inner,) * 2 if point else chip.size, chip.shape == "rectangle"
-    radiance = 1.0 / (math.pi * x * y * (1.0 if square else math.pi / 4.0))
-    return [
-        f'<shape type="{"rectangle" if square else "disk"}" id="light">',
-        f'  <transform name="to_world"><scale x="{real(x / 2)}" y="{real(y / 2)}"/></transform>',
-        f'  <emitter type="area"><rgb name="radiance" value="{real(radiance)}"/></emitter>',
-        "</shape>",
-    ]
+    radiance, lines = 1.0 / (lamp.count * math.pi * x * y * (1.0 if square else math.pi / 4.0)), []
+    for k, (left, up) in enumerate(lamp.places):
+        move = f'<translate x="{real(left)}" y="{real(up)}"/>' if lamp.count > 1 else ""
+        lines += [
+            f'<shape type="{"rectangle" if square else "disk"}" id="light{k or ""}">',
+            f'  <transform name="to_world"><scale x="{real(x / 2)}" y="{real(y / 2)}"/>{move}</transform>',
+            f'  <emitter type="area"><rgb name="radiance" value="{real(radiance)}"/></emitter>',
+            "</shape>",
+        ]
+    return lines

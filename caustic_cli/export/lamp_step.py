@@ -12,6 +12,7 @@ is exact but for rounding.  The surface is trimmed at z = 0, the circle u^2 + v^
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.lamp import surfaces_of
 from caustic_cli.optics.surfaces.polarfield import PolarField
-from caustic_cli.scene import CircularAperture
+from caustic_cli.scene import Aperture, CircularAperture
 from caustic_cli.scene.lamp import Lamp
 
 
@@ -63,21 +64,31 @@ def _raised(space: SplineSpace) -> SplineSpace:
 
 def write_lamp_step(path: Path, lamp: Lamp, field: PolarField, values: Tensor) -> None:
     """Write the solid atomically; values: control values of r, mm, of one surface or two, see `optics.lamp.sides`."""
-    out, both = Entities(), surfaces_of(lamp, field, values)
-    (rim, hole), shape = (_rim(out, *side) for side in both), OUTLINES[CircularAperture.name]
-    (outer, inner), foot, opening, below = (_surface(out, *side) for side in both), rim, hole, -lamp.base
-    faces = [out.face(outer, out.bound(rim.edges)), out.face(inner, out.bound(turned(hole.edges)), along=False)]
-    if lamp.flange > 0:
-        around = CircularAperture((flange_radius(lamp, *both[0]),) * 2)
+    out, both, below = Entities(), surfaces_of(lamp, field, values), -lamp.base
+    splines, faces, rims, openings = [nurbs(*side) for side in both], [], [], []
+    for place in lamp.places:
+        (outer, inner), (rim, hole) = (
+            [_surface(out, own, place) for own in splines],
+            [_rim(out, *side, 0.0, place) for side in both],
+        )
+        faces += [out.face(outer, out.bound(rim.edges)), out.face(inner, out.bound(turned(hole.edges)), along=False)]
+        opening = hole
+        if lamp.base > 0:
+            opening = _rim(out, *both[1], below, place)
+            faces += walls(out, _extruded(out, opening), hole, opening, along=False)
+        rims.append(rim)
+        openings.append(opening)
+    foot, shape = rims[0], OUTLINES[CircularAperture.name]
+    if lamp.count > 1 or lamp.flange > 0:
+        around: Aperture = CircularAperture((flange_radius(lamp, *both[0]),) * 2)
+        if lamp.count > 1:
+            shape, around = OUTLINES[Aperture.name], Aperture(lamp.board)
         edge, foot = shape.flat(out, around, 0.0), shape.flat(out, around, below)
-        faces += [_flat(out, 0.0, edge, rim), *shape.walls(out, around, edge, foot)]
+        faces += [_flat(out, 0.0, edge, rims), *shape.walls(out, around, edge, foot)]
     elif lamp.base > 0:
         foot = _rim(out, *both[0], below)
-        faces += walls(out, _extruded(out, foot), rim, foot)
-    if lamp.base > 0:
-        opening = _rim(out, *both[1], below)
-        faces += walls(out, _extruded(out, opening), hole, opening, along=False)
-    faces.append(_flat(out, below, foot, opening, up=False))
+        faces += walls(out, _extruded(out, foot), rims[0], foot)
+    faces.append(_flat(out, below, foot, openings, up=False))
     product(out, [closed(out, faces)], ROUND_UNCERTAINTY)
     with atomic_file(path, "ascii") as file:
         file.write(HEAD)
@@ -85,10 +96,10 @@ def write_lamp_step(path: Path, lamp: Lamp, field: PolarField, values: Tensor) -
         file.write(TAIL)
 
 
-def _surface(out: Entities, field: PolarField, values: Tensor) -> str:
-    """The NURBS surface; its normal is directed away from the origin."""
-    spaces, poles, weights = nurbs(field, values)
-    points = ",".join(f"({','.join(map(out.point, row))})" for row in poles)
+def _surface(out: Entities, spline: tuple[tuple[SplineSpace, SplineSpace], np.ndarray, np.ndarray], place: np.ndarray) -> str:
+    """The NURBS surface of `nurbs` at a place (x, y) mm; its normal is directed away from there."""
+    spaces, poles, weights = spline
+    points = ",".join(f"({','.join(map(out.point, row))})" for row in poles + np.append(place, 0.0))
     return out.add(
         f"(BOUNDED_SURFACE()B_SPLINE_SURFACE({spaces[0].degree},{spaces[1].degree},({points}),.UNSPECIFIED.,.F.,.F.,.F.)"
         f"B_SPLINE_SURFACE_WITH_KNOTS({','.join(knot_lists(*(s.knots.numpy() for s in spaces)))},.UNSPECIFIED.)"
@@ -97,11 +108,11 @@ def _surface(out: Entities, field: PolarField, values: Tensor) -> str:
     )
 
 
-def _rim(out: Entities, field: PolarField, values: Tensor, z: float = 0.0) -> Loop:
-    """The edge of a surface in the plane of the chip, or below it at z."""
+def _rim(out: Entities, field: PolarField, values: Tensor, z: float, place: Sequence[float] | np.ndarray = (0.0, 0.0)) -> Loop:
+    """The edge of a surface in the plane of the chip, or below it at z, of a lamp at a place (x, y)."""
 
     def on(t: np.ndarray) -> np.ndarray:
-        return rim_points(field, values, t) + np.array([0.0, 0.0, z])
+        return rim_points(field, values, t) + np.append(place, z)
 
     return ring(out, on, 8 * max(field.shape))[0]
 
@@ -112,8 +123,9 @@ def _extruded(out: Entities, lower: Loop) -> list[str]:
     return [out.add(f"SURFACE_OF_LINEAR_EXTRUSION('',{curve},{upwards})") for curve in lower.curves]
 
 
-def _flat(out: Entities, z: float, around: Loop, hole: Loop, up: bool = True) -> str:
-    """A plane ring between two loops, which looks up or down."""
+def _flat(out: Entities, z: float, around: Loop, holes: Sequence[Loop], up: bool = True) -> str:
+    """A plane within a loop and without others, which looks up or down."""
     plane = out.plane((0.0, 0.0, z), (0.0, 0.0, 1.0 if up else -1.0), (1.0, 0.0, 0.0))
-    loops = (around.edges, turned(hole.edges)) if up else (turned(around.edges), hole.edges)
-    return out.face(plane, out.bound(loops[0]), out.bound(loops[1], False))
+    outside = around.edges if up else turned(around.edges)
+    inside = [turned(hole.edges) if up else hole.edges for hole in holes]
+    return out.face(plane, out.bound(outside), *(out.bound(edges, False) for edges in inside))

@@ -22,7 +22,7 @@ from torch import Tensor
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident, lit_rectangle
-from caustic_cli.inverse.projection import BeamProjection, ScreenProjection, seen_by_light
+from caustic_cli.inverse.projection import BeamProjection, CrossedProjection, ScreenProjection, seen_by_light
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scattered import Pixels
 from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
@@ -170,7 +170,14 @@ class _Grid:
         return fine, z
 
     def projection(self, mean: float) -> Projection | None:
-        """Projection of the screen for a surface of this mean height; None for an upright plane screen."""
+        """Projection of the screen for a surface of this mean height; None for an upright plane screen without a crossing."""
+        found, lens = self._uncrossed(mean), self.scene.lens
+        if not lens.crossing:
+            return found
+        return CrossedProjection(found or ScreenProjection(self.scene.screen, mean, lens.interaction.side), found is None)
+
+    def _uncrossed(self, mean: float) -> Projection | None:
+        """The same for light that does not cross over."""
         screen = self.scene.screen
         if self.scene.behind:
             return RelayedScreen(self.scene, mean)

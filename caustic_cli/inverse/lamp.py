@@ -61,24 +61,22 @@ def wanted(goal: Goal, picture: np.ndarray, pixels: tuple[int, int]) -> Tensor:
     """The part of the light wanted on each pixel, of sum 1: (n_x, n_y) float64.
 
     picture: (a, b) irradiance on a plane, or intensity in the far field, any scale; [i, j] with i along +x.  In the far field the
-    solid angle of a pixel falls with the cosine of its latitude.
+    solid angle of a pixel varies, and what lies beyond 90 degrees from the axis is dark.
 
     Raises:
         InputError: it is black.
     """
     power = target_on_screen(picture, goal.size, Screen(goal.size, resolution=pixels)) * goal.shares(pixels)
+    if goal.far:
+        power = power * (goal.directions(pixels)[:, 2] > 0).reshape(pixels)
+        if not power.any():
+            raise InputError("the picture has no light within 90 degrees of the axis")
     return torch.from_numpy(power / power.sum())
 
 
 def directions_of(goal: Goal, pixels: tuple[int, int]) -> Tensor:
     """Unit directions from the origin to the centres of pixels, (n_x n_y, 3)."""
-    axes = [((torch.arange(n, dtype=torch.float64) + 0.5) / n - 0.5) * s for n, s in zip(pixels, goal.size, strict=True)]
-    x, y = (c.reshape(-1) for c in torch.meshgrid(*axes, indexing="ij"))
-    if goal.far:
-        x, y = torch.deg2rad(x), torch.deg2rad(y)
-        return torch.stack([torch.sin(x) * torch.cos(y), torch.sin(y), torch.cos(x) * torch.cos(y)], 1)
-    found = torch.stack([x + goal.shift[0], y + goal.shift[1], torch.full_like(x, goal.distance)], 1)
-    return found / found.norm(dim=1, keepdim=True)
+    return torch.from_numpy(goal.directions(pixels))
 
 
 class LampObjective:

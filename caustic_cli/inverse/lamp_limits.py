@@ -35,7 +35,7 @@ def etendue_limit(lamp: Lamp, goal: Goal) -> float:
     pixels = pixels_of(goal, PIXELS)
     cosine = directions_of(goal, pixels)[:, 2].numpy()
     if goal.far:
-        solid = math.radians(goal.size[0]) * 2.0 * math.sin(math.radians(0.5 * goal.size[1])) * goal.shares(pixels).reshape(-1)
+        solid = goal.solid_angle * goal.shares(pixels).reshape(-1)
     else:
         solid = math.prod(goal.size) / len(cosine) * cosine**3 / goal.distance**2
     return float((solid * 0.5 * math.pi * lamp.radius**2 * (1.0 + cosine)).sum()) / (math.pi * area)

@@ -22,6 +22,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -32,6 +33,9 @@ from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.screen_shape import points_in_space, shape_of
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.scene.screen import tilt_to
+
+if TYPE_CHECKING:  # another projection, of which this one knows no more
+    from caustic_cli.inverse.relay import RelayedScreen
 
 #: Cells of the plane per pixel along each axis: with 1 the picture is blurred, and the initial error on a sphere 0.28, not 0.24.
 FINER = 2
@@ -191,6 +195,63 @@ class BeamProjection(ScreenProjection):
         a, b = u / self.distance, v / self.distance
         along = np.sqrt(np.maximum(1.0 - a * a - b * b, 0.0))
         return np.stack([a, b, self.forward * along]).reshape(3, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class CrossedProjection:
+    """A projection turned by half a turn, (-u, -v): optimal transport onto it is the map of light that crosses over.
+
+    regular: the screen is upright and plane, so that its pixels are a lattice already.
+    """
+
+    of: ScreenProjection | RelayedScreen
+    regular: bool = False
+
+    @property
+    def sign(self) -> float:
+        """As of a `ScreenProjection`, opposite."""
+        return -self.of.sign
+
+    @property
+    def axial_scale(self) -> tuple[float, float]:
+        """As of the projection."""
+        return self.of.axial_scale
+
+    @property
+    def aligned(self) -> bool:
+        """As of the projection."""
+        return self.regular or self.of.aligned
+
+    def gain(self, index: float) -> float:
+        """As of the projection."""
+        return self.of.gain(index)
+
+    def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(u, v) of points x, y of the screen, mm."""
+        u, v = self.of.project(x, y)
+        return -u, -v
+
+    def screen_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """x, y of the points of the screen that project to (u, v)."""
+        return self.of.screen_coordinates(-u, -v)
+
+    def directions_to(self, u: np.ndarray, v: np.ndarray) -> Callable[..., tuple]:
+        """As of a `ScreenProjection`."""
+        return self.of.directions_to(-u, -v)
+
+    def intersections(self, origin: tuple, direction: tuple) -> tuple[np.ndarray, np.ndarray]:
+        """(u, v) of rays, components (N,), NaN where they miss the screen."""
+        u, v = self.of.intersections(origin, direction)
+        return -u, -v
+
+    def projected_target(self, target: np.ndarray) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+        """As of the projection; of an upright plane screen its pixels as they are."""
+        if self.regular and isinstance(self.of, ScreenProjection):
+            screen = self.of.screen
+            power, half, (x, y) = target, screen.half_size, screen.shift
+        else:
+            power, half, (x, y) = self.of.projected_target(target)
+        return np.ascontiguousarray(power[::-1, ::-1]), half, (-x, -y)
 
 
 def stretching_surface(scene: Scene, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -33,14 +33,14 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.projection import ScreenProjection
+from caustic_cli.inverse.projection import CrossedProjection, ScreenProjection
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scattered import Pixels
 from caustic_cli.inverse.transport import LEVELS, Transport, corners, solve, solve_displaced
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
 
-Projection = ScreenProjection | RelayedScreen  # of a screen that is not the plane z_screen
+Projection = ScreenProjection | RelayedScreen | CrossedProjection  # of a screen that is not the plane z_screen
 #: Cells over which e is smoothed, each with its share where there is light: wide averages count where there is none nearby.
 SMOOTHING = {2.0: 1.0, 8.0: 1e-3, 32.0: 1e-6}
 DISTINCT = 1e-9  # least usual stretch over the greatest, where most light goes to one point

@@ -61,6 +61,8 @@ def _headlamp() -> np.ndarray:
 #: Pictures by name, where there is no such file: a uniform rectangle, a disc and a passing beam; pixels across the latter two, and
 #: height of the cut-off, 1 being the upper edge.
 NAMED, DISC, CUT_OFF = {"uniform": lambda: np.ones((2, 2)), "disc": _disc, "headlamp": _headlamp}, 500, 0.8
+#: Name of one that follows from where a lamp throws it, see `project.road_target`.
+ROAD = "road"
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +132,11 @@ class Picture:
     def encoded(self) -> bytes:
         """The picture as a lossless file whose name ends in `suffix`."""
         return _npy(self.values) if self.suffix == ".npy" else _png(Image.fromarray(self.values))
+
+
+def is_road(path: Path | Piped) -> bool:
+    """Whether a target is ROAD, and no file of that name."""
+    return not isinstance(path, Piped) and f"{path}" == ROAD and not path.exists()
 
 
 def read_picture(path: str | Path | Piped, linear: bool = False, color: bool = False, invert: bool = False) -> Picture:

@@ -55,6 +55,8 @@ DENSER, CORNERS = 1.0, 1.1
 LATTICE = (0.7548776662466927, 0.5698402909980532)
 LAMBERTIAN = Chip()
 _DEGREE = 180.0 / math.pi
+#: Squared sine of an angle below which the angle is its sine and the next term of the series.
+NEAR = 1e-8
 
 
 class ChipRays(NamedTuple):
@@ -346,8 +348,26 @@ def land(goal: Goal, light: LampLight) -> tuple[Tensor, Tensor, Tensor]:
     Light towards z <= 0 never meets a plane: it has the coordinates of a shallow ray.
     """
     (x, y, z), (dx, dy, dz) = light.point, light.direction
-    if goal.far:
+    if goal.far and goal.projection == "latitude":
         return torch.atan2(dx, dz) * _DEGREE, torch.asin(dy.clamp(-1.0 + 1e-12, 1.0 - 1e-12)) * _DEGREE, dz > 0
+    if goal.far:
+        scale, ahead = _radial(goal.projection, dx, dy, dz)
+        return dx * scale * _DEGREE, dy * scale * _DEGREE, ahead
     ahead = dz > SHALLOW
     t = (goal.distance - z) / torch.where(ahead, dz, torch.full_like(dz, SHALLOW))
     return x + t * dx - goal.shift[0], y + t * dy - goal.shift[1], ahead
+
+
+def _radial(projection: str, dx: Tensor, dy: Tensor, dz: Tensor) -> tuple[Tensor, Tensor]:
+    """Radius of directions on a map about the axis (`scene.anglemap`) over the sine of their angle from it, and whether they are
+    followed there."""
+    if projection == "gnomonic":
+        ahead = dz > SHALLOW
+        return 1.0 / torch.where(ahead, dz, torch.full_like(dz, SHALLOW)), ahead
+    ahead = dz > 0
+    if projection == "stereographic":
+        return 2.0 / (1.0 + torch.where(ahead, dz, torch.zeros_like(dz))), ahead
+    square = dx * dx + dy * dy
+    near = square < NEAR
+    sine = torch.where(near, torch.ones_like(square), square).sqrt()
+    return torch.where(near, 1.0 + square / 6.0, torch.atan2(sine, dz) / sine), ahead

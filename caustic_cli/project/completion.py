@@ -180,7 +180,8 @@ def complete_lens(s: Settings, source: Source) -> LensSettings:
     interaction.check_room(z, lowest, highest)
     if "radius" not in lens:
         # The pictures of lenslets are superimposed: the light through their centres converges like that of a focusing lens.
-        across, along = (t / w if k == 1 else 0.0 for t, w, k in zip(s.target.size, lens.size, array, strict=True))
+        way = -1.0 if lens.crossing else 1.0
+        across, along = (way * t / w if k == 1 else 0.0 for t, w, k in zip(s.target.size, lens.size, array, strict=True))
         vergence = 0.0
         if source.nearest < lens.z_in:  # vergence at the surface, 1/mm; 0 for a source at infinity
             inside = interaction.interior(Interior(index)).index

@@ -14,7 +14,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.io.files import Piped
 from caustic_cli.io.photometry import SUFFIXES, read_photometry
-from caustic_cli.io.picture import Picture, read_picture
+from caustic_cli.io.picture import Picture, is_road, read_picture
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.obstruction import clear_shift
 from caustic_cli.project import attachments, colours, uptodate
@@ -23,6 +23,7 @@ from caustic_cli.project.project import Project
 from caustic_cli.schema.table import Parameters, TargetSettings
 
 photometric_target = OnDemand("caustic_cli.project.photometric_target")
+road_target = OnDemand("caustic_cli.project.road_target")
 
 
 def new_project(
@@ -52,8 +53,7 @@ def new_project(
     picture = (
         target
         if isinstance(target, Picture)
-        else _photometric(target, said, parameters)
-        or read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
+        else _of_lamps(target, said, parameters) or read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
     )
     if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
         del said["source"]["weights"]
@@ -81,21 +81,27 @@ def new_project(
     return Project(out, full, picture, asked, without_waves=without_waves(full, "stages" in said.get("design", {}))), said
 
 
-def _photometric(target: Path | Piped, said: Given, parameters: Parameters) -> Picture | None:
-    """The picture of a photometric file, None for another file; a lamp without a size of its picture gets the angles of its light.
+def _of_lamps(target: Path | Piped, said: Given, parameters: Parameters) -> Picture | None:
+    """The picture of a target that follows from where a lamp throws it, a photometric file or that of `road_target`, None for
+    another; without a size of its picture a lamp gets the angles of the file's light.
 
     Raises:
         InputError: the file is damaged or has no light, or the design is none of a lamp.
     """
-    if isinstance(target, Piped) or target.suffix.lower() not in SUFFIXES:
+    if isinstance(target, Piped):
+        return None
+    by_name = is_road(target)
+    if not (by_name or target.suffix.lower() in SUFFIXES):
         return None
     if "lamp" not in said:
-        raise InputError(f"{target}: is a photometric file, whose light lamps throw: ⟨+lamp.radius⟩ is needed")
-    light, lamp = read_photometry(target), said["lamp"]
+        what = "the illuminance of a road" if by_name else "a photometric file"
+        raise InputError(f"{target}: is {what}, whose light lamps throw: ⟨+lamp.radius⟩ is needed")
+    lamp, light = said["lamp"], None if by_name else read_photometry(target)
     try:
-        if "angles" not in lamp and "picture_size" not in parameters and "size" not in said.get("target", {}):
-            said["lamp"] = {**lamp, "angles": photometric_target.angles_of(light)}
-        return Picture(photometric_target.picture_of(light, goal_of(complete(said, 1.0, parameters))), "linear")
+        if light and "angles" not in lamp and "picture_size" not in parameters and "size" not in said.get("target", {}):
+            said["lamp"] = {**lamp, "angles": photometric_target.angles_of(light, lamp.get("projection", "latitude"))}
+        goal = goal_of(complete(said, 1.0, parameters))
+        return Picture(photometric_target.picture_of(light, goal) if light else road_target.picture_of(goal), "linear")
     except InputError as error:
         raise InputError(f"{target}: {error}") from error
 

@@ -13,7 +13,8 @@ from scipy.interpolate import PchipInterpolator
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lamp import directions_of, pixels_of
 from caustic_cli.io.photometry import Photometry
-from caustic_cli.scene.lamp import WIDEST, Goal
+from caustic_cli.scene import anglemap
+from caustic_cli.scene.lamp import Goal
 
 #: Pixels of the picture, and part of the greatest intensity that counts as light.
 PIXELS, DARK = 60_000, 0.005
@@ -21,8 +22,8 @@ PIXELS, DARK = 60_000, 0.005
 FINER = 6
 
 
-def angles_of(light: Photometry) -> tuple[float, float]:
-    """Width and height, degrees, of the smallest target in the far field, centred on the axis, that holds all light.
+def angles_of(light: Photometry, projection: str = "latitude") -> tuple[float, float]:
+    """Width and height, degrees, of the smallest target in the far field, centred on the axis of a map, that holds all light.
 
     Raises:
         InputError: there is no light towards z > 0.
@@ -33,9 +34,13 @@ def angles_of(light: Photometry) -> tuple[float, float]:
     if len(light.angles) < 2 or not lit.any():
         raise InputError("has no light within 90 degrees of its axis")
     x, y, z = np.sin(gamma) * np.cos(plane), np.sin(gamma) * np.sin(plane), np.cos(gamma)
-    width, height = (2.0 * math.degrees(float(np.abs(angle[lit]).max())) for angle in (np.arctan2(x, z), np.arcsin(y)))
-    least = 2.0 * float(light.angles[1] - light.angles[0])
-    return min(max(width, least), WIDEST), min(max(height, least), WIDEST)
+    coordinates = (np.arctan2(x, z), np.arcsin(y))
+    if projection in anglemap.RADIAL:
+        radius, back, *_ = anglemap.RADIAL[projection]
+        coordinates = back(radius(gamma) * abs(np.cos(plane))), back(radius(gamma) * abs(np.sin(plane)))
+    width, height = (2.0 * math.degrees(float(np.abs(angle[lit]).max())) for angle in coordinates)
+    least, most = 2.0 * float(light.angles[1] - light.angles[0]), anglemap.widest_of(projection)
+    return min(max(width, least), most), min(max(height, least), most)
 
 
 def refined(light: Photometry) -> Photometry:

@@ -13,16 +13,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.scene import anglemap
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.rayset import RaySet
 
 SHAPES = ("point", "disc", "rectangle", "rays")
 #: Width of the classes of angles in which the intensity of a ray file is counted, degrees.
 CLASS = 5.0
-#: Widest target in the far field, degrees, along x and y: a lamp emits into z > 0.
-WIDEST = 178.0
+#: Points of a pixel along both axes at which its solid angle is taken, and pixels of that of a whole target.
+WITHIN, WHOLE = 3, (300, 300)
 #: Border of a target, a fraction of its smaller side, that is no part of its interior: least, and most where a chip blurs more.
 BORDERS = (0.025, 0.1)
+#: Most lamps of an array.
+MOST_LAMPS = 400
 #: Largest ratio of its sides, and least distance of a plane target in radii of the lens.
 OBLONG, NEAREST = 100.0, 2.0
 
@@ -43,6 +46,8 @@ class Chip:
     intensity: Distribution | None = None
     #: Of a ray file, in the frame of the lamp.
     rays: RaySet | None = None
+    #: Part of the light that comes back to it which it reflects, diffusely.
+    reflectance: float = 0.0
 
     @classmethod
     def of_rays(cls, rays: RaySet) -> Chip:
@@ -62,6 +67,8 @@ class Chip:
     def __post_init__(self):
         if self.shape not in SHAPES or (self.shape == "rays") != (self.rays is not None):
             raise InputError(f"the shape of a chip must be one of {', '.join(SHAPES[:3])}, got {self.shape!r}")
+        if not 0 <= self.reflectance <= 1:
+            raise InputError(f"the reflectance of a chip must be 0 to 1, got {self.reflectance!r}")
         if self.rays is not None:
             return
         if not all(math.isfinite(s) and s >= 0 for s in self.size):
@@ -88,18 +95,20 @@ class Chip:
 class Goal:
     """Where the light is wanted: a rectangle of a plane z = distance, or of angles in the far field, centred on the axis there.
 
-    Angles are those of type A photometry: along x the longitude about the y axis, atan2(x, z), along y the latitude, asin y.
+    In the far field x and y are those of a map of the directions, see `anglemap`.
 
     Raises:
         InputError: out of range.
     """
 
-    #: Full width and height, mm on the plane or degrees in the far field.
+    #: Full width and height, mm on the plane or degrees of the map in the far field.
     size: tuple[float, float]
     #: Of the plane, mm; inf for the far field.
     distance: float = math.inf
     #: Of its centre on the plane, from the axis, mm; 0 in the far field.
     shift: tuple[float, float] = (0.0, 0.0)
+    #: Of the directions in the far field, one of `anglemap.MAPS`.
+    projection: str = "latitude"
 
     def __post_init__(self):
         if not all(0 < s < math.inf for s in self.size):
@@ -114,26 +123,68 @@ class Goal:
             raise InputError(f"the shift of a target must be finite, got {self.shift}")
         if self.far and self.shift != (0.0, 0.0):
             raise InputError(f"a target in the far field is centred on the axis, got a shift of {self.shift}")
-        if self.far and max(self.size) > WIDEST:
-            raise InputError(f"a target in the far field is at most {WIDEST:g} degrees wide and high, got {self.size}")
+        if self.projection not in anglemap.MAPS or (self.projection != "latitude" and not self.far):
+            raise InputError(
+                f"the projection of a target in the far field is one of {', '.join(anglemap.MAPS)}, and of a plane there is none"
+            )
+        if self.far and not max(self.angles) <= (widest := anglemap.widest_of(self.projection)) + 1e-9:
+            raise InputError(
+                f"a target in the far field is at most {widest:g} degrees wide and high, got {self.angles[0]:g} x"
+                f" {self.angles[1]:g}"
+            )
 
     @property
     def far(self) -> bool:
         """Whether it is in the far field."""
         return math.isinf(self.distance)
 
+    @property
+    def by_latitude(self) -> bool:
+        """Whether it is in the far field, and along y is the latitude."""
+        return self.far and self.projection == "latitude"
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """Full angles about the axis of its width and height in the far field, degrees."""
+        width, height = (anglemap.angle_of(self.projection, s) for s in self.size)
+        return width, height
+
+    @property
+    def solid_angle(self) -> float:
+        """Of a target in the far field, sr."""
+        return float(self._solid_angles(WHOLE).sum())
+
+    def _solid_angles(self, pixels: tuple[int, int]) -> np.ndarray:
+        """Of each pixel in the far field, (n_x, n_y), sr: exact by latitude, else by WITHIN^2 points of each."""
+        if self.projection == "latitude":
+            along = np.diff(np.sin(np.radians(self.size[1] * (np.arange(pixels[1] + 1) / pixels[1] - 0.5))))
+            return np.outer(np.full(pixels[0], math.radians(self.size[0]) / pixels[0]), along)
+        x, y = np.meshgrid(*self._centres((WITHIN * pixels[0], WITHIN * pixels[1])), indexing="ij")
+        found = anglemap.solid_angles_at(self.projection, x, y).reshape(pixels[0], WITHIN, pixels[1], WITHIN).mean((1, 3))
+        return found * math.prod(self.size) / math.prod(pixels)
+
+    def _centres(self, pixels: tuple[int, int]) -> list[np.ndarray]:
+        """Coordinates of the centres of pixels from that of the target, (n_x,) and (n_y,), mm or degrees."""
+        return [((np.arange(n) + 0.5) / n - 0.5) * s for n, s in zip(pixels, self.size, strict=True)]
+
+    def directions(self, pixels: tuple[int, int]) -> np.ndarray:
+        """Unit directions from the origin to the centres of pixels, (n_x n_y, 3)."""
+        x, y = (c.reshape(-1) for c in np.meshgrid(*self._centres(pixels), indexing="ij"))
+        if self.far:
+            return anglemap.directions_at(self.projection, x, y)
+        found = np.stack([x + self.shift[0], y + self.shift[1], np.full_like(x, self.distance)], 1)
+        return found / np.linalg.norm(found, axis=1, keepdims=True)
+
     def shares(self, pixels: tuple[int, int]) -> np.ndarray:
         """Part of each pixel in the area of a plane target, or in the solid angle of one in the far field: (n_x, n_y), of sum 1."""
-        across, along = np.ones(pixels[0]), np.ones(pixels[1])
-        if self.far:
-            along = np.diff(np.sin(np.radians(self.size[1] * (np.arange(pixels[1] + 1) / pixels[1] - 0.5))))
-        return np.outer(across / across.sum(), along / along.sum())
+        found = self._solid_angles(pixels) if self.far else np.ones(pixels)
+        return found / found.sum()
 
     @property
     def nearest_edge(self) -> float:
         """Angle from the axis of the middle of the nearest edge, degrees; negative if the axis misses the target."""
         if self.far:
-            return min(self.size) / 2
+            return min(self.angles) / 2
         reach = min(s / 2 - abs(c) for c, s in zip(self.shift, self.size, strict=True))
         return math.degrees(math.atan(reach / self.distance))
 
@@ -164,8 +215,20 @@ class Lamp:
     #: Thickness of the foot below the plane of the chip, and width of its flange beyond the rim of the lens, mm.
     base: float = 0.0
     flange: float = 0.0
+    #: Lamps of an array along x and y, each with its chip, and their distances, mm: one part on a board, which the foot is.
+    array: tuple[int, int] = (1, 1)
+    pitch: tuple[float, float] = (0.0, 0.0)
+    #: Whether light that is reflected within the lens is followed (`optics.lamp_ghosts`) instead of booked as lost.
+    ghosts: bool = False
 
     def __post_init__(self):
+        if not (min(self.array) >= 1 and self.count <= MOST_LAMPS):
+            raise InputError(f"⟨lens.array⟩ of a lamp holds 1 to {MOST_LAMPS} lamps, got {self.array[0]} x {self.array[1]}")
+        if self.count > 1 and not (self.base > 0 and all(2.0 * self.radius < p < math.inf for p in self.pitch)):
+            raise InputError(
+                f"⟨lamp.pitch⟩ must be greater than twice ⟨+lamp.radius⟩, {2.0 * self.radius:g} mm, and ⟨+lamp.base⟩, the board"
+                f" that holds an array, greater than 0 mm, got {self.pitch[0]:g} x {self.pitch[1]:g} and {self.base:g} mm"
+            )
         if self.surfaces not in (1, 2):
             raise InputError(f"a lamp has 1 or 2 free-form surfaces, got {self.surfaces!r}")
         if not 1.0 < self.index <= 5.0:
@@ -184,6 +247,23 @@ class Lamp:
                 f"⟨lamp.radius⟩ must be greater than ⟨+lamp.inner⟩ and ⟨+lamp.wall⟩ together, {self.inner + self.wall:g} mm, got"
                 f" {self.radius:g} mm"
             )
+
+    @property
+    def count(self) -> int:
+        """Number of lamps."""
+        return math.prod(self.array)
+
+    @property
+    def places(self) -> np.ndarray:
+        """Centres of the chips (count, 2), mm, y varying fastest; their mean is the origin."""
+        x, y = (p * (np.arange(n) - 0.5 * (n - 1)) for n, p in zip(self.array, self.pitch, strict=True))
+        return np.stack([c.reshape(-1) for c in np.meshgrid(x, y, indexing="ij")], 1)
+
+    @property
+    def board(self) -> tuple[float, float]:
+        """Half width and height of the board of an array, mm: a cell of the lattice for each lamp, and the flange around."""
+        x, y = (0.5 * n * p + self.flange for n, p in zip(self.array, self.pitch, strict=True))
+        return x, y
 
     def blur(self, goal: Goal) -> float:
         """Full width of a point of the picture, mm or degrees: the chip as seen from the greatest radius of the lens, on the

@@ -140,6 +140,8 @@ class Lens:
     entrance: FreeForm | None = None
     #: Gradient-index distribution, with `index` for n_0 of its formula; None for a homogeneous lens.
     gradient: Gradient | None = None
+    #: Of the two surfaces that send light to a picture, the one behind which it crosses over.
+    crossing: bool = default("lens.crossing")
 
     def __post_init__(self):
         check_all(

@@ -299,10 +299,12 @@ class LampSettings(Section):
             option=Option("--lamp-surfaces", "1|2"))
     wall: float = setting("least distance between hemisphere and free-form surface", "mm", *LENS, default=1.0, why="injection"
             " moulding of acrylic", option=Option("--lamp-wall", "MM"))
-    base: float = setting("thickness of the foot of the lens, below the plane of the chip", "mm", 0.0, 1e6, default=0.0,
-            why="a base in that plane", written=False, option=Option("--lamp-base", "MM"))
+    base: float = setting("thickness of the foot of the lens, below the plane of the chip; of an array of its board, 2 mm", "mm",
+            0.0, 1e6, default=0.0, why="a base in that plane", written=False, option=Option("--lamp-base", "MM"))
     flange: float = setting("width of a flange around the foot for holding, beyond the rim of the lens", "mm", 0.0, 1e6,
             default=0.0, why="none", written=False, option=Option("--lamp-flange", "MM"))
+    pitch: Pair = setting("distances of the lamps of an array along x and y, which are one part on a board as thick as its base",
+            "mm", *LENS, derived="twice lamp.radius and lamp.wall together", option=Option("--pitch", "MM[xMM]"))
     chip: Pair = setting("full width and height of the chip, 0 for a point", "mm", 0.0, 1e6, default=[0.0, 0.0], why="the limit"
             " that a small chip approaches", option=Option("--chip", "W[xH]"))
     shape: str = setting("shape of the chip: rectangle or disc", choices=("rectangle", "disc"), default="rectangle", written=False,
@@ -312,9 +314,15 @@ class LampSettings(Section):
             option=Option("--chip-intensity", "FILE"), file="chip")
     file: str | None = setting("ray file (TM-25 and others, as of a source) of the chip instead, in the frame of the lamp",
             derived="a chip by its size", option=Option("--chip-rays", "FILE"), file="chip-rays")
-    angles: Pair | None = setting("full width and height of the picture in the far field, its values being intensities: longitude"
-            " about the vertical and latitude (type A photometry)", "degrees", 0.0, 178.0, above=True, derived="a picture on a"
-            " screen", option=Option("--angles", "W[xH]"))
+    reflectance: float = setting("part of the light reflected back to the chip by the lens that the chip reflects diffusely; above"
+            " 0, reflected light is followed in the judgement", low=0.0, high=1.0, default=0.0, why="it is booked as lost",
+            written=False, option=Option("--chip-reflectance"))
+    angles: Pair | None = setting("full width and height of the picture in the far field, its values being intensities", "degrees",
+            0.0, 178.0, above=True, derived="a picture on a screen", option=Option("--angles", "W[xH]"))
+    projection: str = setting("coordinates of the picture in the far field: longitude about the vertical and latitude (type A"
+            " photometry); gnomonic, as on a plane; stereographic; or polar, the angle gamma towards C (type C photometry)",
+            choices=("latitude", "gnomonic", "stereographic", "polar"), default="latitude", written=False,
+            option=Option("--projection", "latitude|gnomonic|stereographic|polar"))
 
 
 class LensSettings(Section):
@@ -352,12 +360,14 @@ class LensSettings(Section):
             written=False, option=Option("--finish", "STEP[+STEP...]"))
     mirror: bool = setting("the surface is a mirror, with the screen on the source's side, beside its light", default=False,
             written=False, option=Option("--mirror"))
+    crossing: bool = setting("the light crosses over on its way to the screen: a surface that is convex where the other one,"
+            " without it, is concave, or less convex", default=False, written=False, option=Option("--crossing"))
     aperture: str = setting("shape of the lens: rectangle, or circle, the largest within size", choices=("rectangle", "circle"),
             default="rectangle", written=False, option=Option("--aperture", "rectangle|circle"))
     border: float = setting("width of a mounting rim around the aperture in exported solids", "mm", 0.0, 1e6, default=0.0,
             written=False, option=Option("--border", "MM"))
-    array: Wholes = setting("lenslets along x and y, each of which projects the whole picture", low=1, high=100, default=[1, 1],
-            written=False, option=Option("--array", "N[xM]"))
+    array: Wholes = setting("lenslets along x and y, each of which projects the whole picture, or lamps on a board", low=1,
+            high=100, default=[1, 1], written=False, option=Option("--array", "N[xM]"))
     gradient: str | None = setting("gradient index of the lens: selfoc, radial or axial, with gradient_terms; volume, with an"
             " index_file; free, designed instead of the surface, between flat sides",
             choices=("selfoc", "radial", "axial", "volume", "free"), derived="homogeneous",

@@ -19,6 +19,8 @@ from torch import Tensor
 from caustic_cli.effort import STANDARD
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.lamp import LOSSES, LampLight, emissions, land, least_wall, sides, through
+from caustic_cli.optics.lamp_array import among
+from caustic_cli.optics.lamp_ghosts import ghosts
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.polarfield import PolarField
@@ -53,9 +55,14 @@ class LampImage(NamedTuple):
 def traced(lamp: Lamp, field: PolarField, values: Tensor, rays: int, seed: int) -> Iterator[tuple[int, LampLight]]:
     """Light behind the lens of two independent halves of about `rays` rays of sum 1 each, in parts: number of the half, light."""
     for half in (0, 1):
+        rng = np.random.default_rng(stream(seed, f"array {half}"))
         for part in emissions(lamp.chip, max(1, rays // 2), stream(seed, f"lamp {half}")):
             with torch.no_grad():
-                yield half, through(lamp, field, part, values)
+                lights = [through(lamp, field, part, values)]
+                if lamp.ghosts:
+                    lights.append(ghosts(lamp, field, values, part, rng))
+                for light in lights:
+                    yield half, light if lamp.count == 1 else among(lamp, field, values, light, rng)
 
 
 def lamp_image(
@@ -80,13 +87,13 @@ def lamp_image(
         image, outside = splat(x, y, arriving, screens[0], Filter())
         halves[half] += image
         fewer += 0.5 * splat(x, y, arriving, screens[1], Filter())[0]
-        if goal.far:
+        if goal.by_latitude:
             near = torch.where(x.abs() <= STRIP, 0.5 * arriving, torch.zeros_like(x))
             rise += torch.bincount(((y + 90.0) / STEP).long(), near, len(rise))
         for cause, power in light.lost.items():
-            lost[cause] += 0.5 * float(power.sum())
+            lost[cause] = lost.get(cause, 0.0) + 0.5 * float(power.sum())
         lost["elsewhere"] += 0.5 * float(outside + (light.power - arriving).sum())
-        count += len(light.power)
+        count += len(light.spare)
     one, other = halves.numpy()
     return LampImage(0.5 * (one + other), fewer.numpy(), (one, other), lost, count, rise.numpy())
 
@@ -175,9 +182,10 @@ def lamp_figures(
         "interior_noise": interior[1],
         "uniformity": uniformity,
         "border": lamp.border(goal),
+        "border_unit": goal.unit,
         "uncoated_limit": lamp.uncoated_limit,
         "lost": found.lost,
-        **({"cut_off": cut_off(found.rise)} if goal.far else {}),
+        **({"cut_off": cut_off(found.rise)} if goal.by_latitude else {}),
         "least_wall": least_wall(lamp, field, values),
         "greatest_radius": field.extent(sides(values)[1])[1],
         "pixels": list(pixels),

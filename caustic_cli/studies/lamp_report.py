@@ -67,8 +67,7 @@ def density(goal: Goal, image: np.ndarray) -> np.ndarray:
     """Illuminance, lx, or intensity, cd, of a chip of FLUX lumens, from the part of its light on each pixel (n_x, n_y)."""
     shares = goal.shares((image.shape[0], image.shape[1]))
     if goal.far:
-        across, up = (math.radians(s) for s in goal.size)
-        return FLUX * image / (shares * across * 2.0 * math.sin(0.5 * up))
+        return FLUX * image / (shares * goal.solid_angle)
     return FLUX * image / (shares * goal.size[0] * goal.size[1] / 1e6)
 
 
@@ -80,7 +79,10 @@ def _extent(goal: Goal) -> tuple[float, float, float, float]:
 
 
 def _labelled(axis: Axes, goal: Goal, title: str) -> None:
-    names = ("longitude (degrees)", "latitude (degrees)") if goal.far else ("x (m)", "y (m)")
+    names = ("x (m)", "y (m)")
+    if goal.far:
+        kind = goal.projection
+        names = ("longitude (degrees)", "latitude (degrees)") if kind == "latitude" else (f"x ({kind}, degrees)", "y (degrees)")
     axis.set(title=title, xlabel=names[0], ylabel=names[1])
 
 

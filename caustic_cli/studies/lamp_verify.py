@@ -43,7 +43,7 @@ def verify_lamp(
     rng = np.random.default_rng([seed, 1])
     image, squares = np.zeros((2, *pixels))
     for start in range(0, rays, CHUNK):
-        *points, weight = follow(mi, world, shapes, SURFACES, *_emitted(lamp.chip, min(CHUNK, rays - start), rng))
+        *points, weight = follow(mi, world, shapes, SURFACES, *_emitted(lamp, min(CHUNK, rays - start), rng))
         x, y = (p - middle for p, middle in zip(points, seen.shift, strict=False))
         for total, power in ((image, weight), (squares, weight**2)):
             total += np.histogram2d(x, y, pixels, [(-0.5 * s, 0.5 * s) for s in seen.size], weights=power)[0]
@@ -57,7 +57,15 @@ def verify_lamp(
     return compare(renders, image / rays, squares / rays**2, rays, shift, {"mitsuba": mi.__version__, "variant": variant})
 
 
-def _emitted(chip: Chip, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _emitted(lamp: Lamp, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (3, N) mm on the chips and directions (3, N), see `_of_chip`."""
+    origin, direction = _of_chip(lamp.chip, count, rng)
+    if lamp.count > 1:
+        origin = origin + np.append(lamp.places, np.zeros((lamp.count, 1)), 1)[rng.integers(lamp.count, size=count)].T
+    return origin, direction
+
+
+def _of_chip(chip: Chip, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Origins (3, N) mm on a chip and directions (3, N): by polar angles, independent of `optics.lamp`; of a table by rejection,
     of a ray file its own."""
     if chip.rays is not None:

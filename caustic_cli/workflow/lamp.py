@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -49,6 +50,8 @@ lamp_report = OnDemand("caustic_cli.studies.lamp_report")
 
 #: Pixels of a comparison with Mitsuba, and its rays unless given.
 VERIFIED, BESIDE_RAYS = 2400, 1_000_000
+#: The effect that a lamp may have or not.
+GHOSTS = "ghosts"
 #: Part of the brightest pixels of an image that are white.
 WHITE = 0.999
 
@@ -117,7 +120,8 @@ class LampDesign:
         shaded = len(np.unique(self.picture[self.picture > 0])) > 1
         intensities = IntensitySum()
         how: dict[str, Any] = {"shaded": shaded, "rays": rays, "seed": seed, "also": intensities.add}
-        found, figures = lamp_figures(self.lamp, self.goal, self.field, self.values, fine, coarse, **how)
+        with one_thread() if self.lamp.ghosts else nullcontext():  # the tensors of light that is followed further are small
+            found, figures = lamp_figures(self.lamp, self.goal, self.field, self.values, fine, coarse, **how)
         table = intensities.table()
         return Evaluation(found.image, fine, table, figures | table.figures)
 
@@ -151,11 +155,12 @@ class LampDesign:
         Raises:
             CausticError: see `studies.lamp_verify`.
         """
+        lamp = replace(self.lamp, ghosts=False)  # Mitsuba's rays are followed along the direct path
         pixels, seen = pixels_of(self.goal, VERIFIED), plane_of(self.goal, self.lamp.radius)
         with TemporaryDirectory() as folder:
             scene = Path(folder) / "lamp.xml"
-            write_lamp_mitsuba(scene, self.lamp, self.goal, self.field, self.values, pixels, FINE, dark=True)
-            found = verify_lamp(scene, self.lamp, seen, self.field, self.values, pixels, rays, seed)
+            write_lamp_mitsuba(scene, lamp, self.goal, self.field, self.values, pixels, FINE, dark=True)
+            found = verify_lamp(scene, lamp, seen, self.field, self.values, pixels, rays, seed)
         write_panels(panels, found, (0.5 * seen.size[0], 0.5 * seen.size[1]))
         return found.figures | {"image": str(panels)}
 
@@ -257,6 +262,9 @@ def _run(project: Project, before: Checkpoint | None, force: bool, say: Reporter
 def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
     """What limits a lamp, before its design: its uncoated surfaces, and the deflection of one."""
     yield f"uncoated surfaces pass at most {lamp.uncoated_limit:.1%} of the light, by normal incidence"
+    if lamp.count > 1 and not goal.far:
+        width, height = lamp.places.max(0) - lamp.places.min(0)
+        yield f"the pictures of the lamps lie within {width:g} x {height:g} mm of each other"
     if lamp.surfaces == 2:
         return
     most = math.degrees(math.acos(1.0 / lamp.index))
@@ -283,10 +291,12 @@ def render(
     say: Reporter,
     mitsuba: bool = False,
     report: bool = False,
+    effects: str = "auto",
 ) -> dict[str, Any]:
     """Trace a lamp with independent rays, write its image, and return its figures; arguments as of caustic render.
 
-    mitsuba: compare with Mitsuba as well, and write the panels beside the image; report: write the report there.
+    mitsuba: compare with Mitsuba as well, and write the panels beside the image; report: write the report there; effects: as of
+    `with_effects`.
 
     Raises:
         InputError: there is no lamp, or a file exists already; nothing was written.
@@ -296,12 +306,13 @@ def render(
         path.with_name(name if image is None else f"{path.stem}-{name}") if asked else None
         for name, asked in (("verify.png", mitsuba), (REPORT, report))
     )
-    made = uptodate.Outputs(project, "render", {"rays": rays, "seed": seed, "report": report}, [path, npy, panels, plots])
+    options = {"rays": rays, "seed": seed, "report": report, "effects": effects}
+    made = uptodate.Outputs(project, "render", options, [path, npy, panels, plots])
     if not (force or mitsuba) and (figures := made.found()):
         say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
         return figures
     made.refuse_foreign(force)
-    lamp = LampDesign.of(project)
+    lamp = with_effects(LampDesign.of(project), effects)
     seen = lamp.evaluated(rays, project.seed if seed is None else seed)
     _write_image(path, seen.image, project, lamp.goal, WIDE if image is None else 1)
     if npy is not None:
@@ -314,6 +325,43 @@ def render(
         return figures
     made.keep(figures)
     return figures
+
+
+def with_effects(design: LampDesign, effects: str) -> LampDesign:
+    """The lamp with light that is reflected within it followed, or booked as lost: `ghosts` and `none`; `auto` for the former where
+    the reflectance of its chip is given.
+
+    Raises:
+        InputError: another effect.
+    """
+    if effects == "auto":
+        return design
+    if effects not in ("none", GHOSTS):
+        raise InputError(
+            f"⟨effects⟩ of a lamp must be none, auto or {GHOSTS}, got {effects}: refraction, Fresnel losses, total reflection and"
+            " the size of the chip are always simulated"
+        )
+    return replace(design, lamp=replace(design.lamp, ghosts=effects == GHOSTS))
+
+
+def effects_of(project: Project, effects: str, figures: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Which effects a render simulated, and why, as rows for display; figures: of it."""
+    lamp, lost = lamp_of(project.settings), figures["lost"]
+    reflected = sum(lost.get(cause, 0.0) for cause in ("inner_fresnel", "outer_fresnel", "total_internal_reflection"))
+    chip = f"the chip reflects {lamp.chip.reflectance:g} of the light that returns to it"
+    if effects == GHOSTS or (lamp.ghosts and effects != "none"):
+        ghosts = f"on: {'asked for' if effects == GHOSTS else 'its reflectance is given'}; {chip}"
+    else:
+        why = "asked to be left out" if effects == "none" else "not asked for, and no reflectance of the chip is given"
+        ghosts = f"off: {why}; {reflected:.2%} of the light, reflected at the surfaces, is booked as lost"
+    size = "off: the chip is a point" if lamp.chip.shape == "point" else "on: the chip has a size, which cannot be left out"
+    return [
+        ("fresnel", "on: always, at both surfaces"),
+        ("total_reflection", f"on: always; {lost.get('total_internal_reflection', 0.0):.2%} of the light"),
+        ("source_size", size),
+        (GHOSTS, ghosts),
+        ("diffraction", "off: the target is lit by overlapping parts of an incoherent source"),
+    ]
 
 
 def export(
@@ -355,7 +403,7 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         (
             "relative RMS error",
             f"{number('interior_rms', '.4f')}, noise {number('interior_noise', '.2g')}; with the outer"
-            f" {number('border', '.4g')} {'degrees' if 'cut_off' in figures else 'mm'}"
+            f" {number('border', '.4g')} {figures.get('border_unit', 'mm')}"
             f" {number('relative_rms', '.4f')}, noise {number('noise', '.2g')}",
         ),
         ("least over mean", number("uniformity", ".3f")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -60,10 +61,11 @@ def _mitsuba(path: Path, found: Exported, samples: Samples) -> None:
 
 
 def _photometry(write: Callable[[Path, Photometry], None], path: Path, found: Exported, _: Samples) -> dict[str, Any]:
-    """flux, lm per 1000 lm of the chip, and peak_candela."""
+    """flux, lm per 1000 lm of the chips, and peak_candela; the file of an array holds the light of as many chips of 1000 lm."""
     table = intensity_table(found.lamp, found.field, found.values, rays=current_effort().final_rays, seed=found.seed)
-    greatest, name = found.field.extent(sides(found.values)[1])[1], found.name
-    write(path, Photometry(table.planes, table.angles, table.values, FLUX, name, 2.0 * greatest, greatest))
+    greatest, name, count = found.field.extent(sides(found.values)[1])[1], found.name, found.lamp.count
+    across = 2.0 * (greatest + math.hypot(*found.lamp.places.max(0)))
+    write(path, Photometry(table.planes, table.angles, count * table.values, count * FLUX, name, across, greatest))
     return {"flux": table.flux, "peak_candela": table.peak}
 
 
@@ -77,6 +79,13 @@ FORMATS = {
     "ies": Format(".ies", partial(_photometry, write_ies), False),
     "ldt": Format(".ldt", partial(_photometry, write_ldt), False),
 }
+#: What formats hold that have no lamp.
+HOLDS = {
+    "zemax": "a grid of sags over x and y (Grid Sag)",
+    "lighttools": "the points of a surface over x and y",
+    "gcode": "the path of a tool above a height at each x and y",
+    "phase": "the phase of a thin element at each x and y",
+}
 
 
 def check_export(format: str, samples: Samples | None) -> None:
@@ -86,9 +95,10 @@ def check_export(format: str, samples: Samples | None) -> None:
         InputError: as it says.
     """
     if format not in FORMATS:
+        what = HOLDS.get(format, "a height at each x and y")
         raise InputError(
-            f"⟨format⟩ {format} holds height fields, and a lamp's surface is none; {', '.join(FORMATS)} hold the lamp or its light,"
-            " step for programs of optical design as well"
+            f"⟨format⟩ {format} holds {what}, and a lamp's surface is none of that: it has two sides and may overhang;"
+            f" {', '.join(FORMATS)} hold the lamp or its light, step as a solid for LightTools and OpticStudio, too"
         )
     if samples is not None and not FORMATS[format].sampled:
         raise InputError(f"⟨samples⟩ belongs to {', '.join(name for name in FORMATS if FORMATS[name].sampled)}, got {format}")
