@@ -107,17 +107,17 @@ class Effort:
     )
     #: The same for two free-form surfaces, after the first of the stages above with one.
     two_stages: tuple[tuple[int, int, int, float], ...] = (
-        (800, 30_000, 120, 0.1),
-        (6_000, 60_000, 80, 0.03),
+        (800, 30_000, 180, 0.3),
+        (6_000, 60_000, 90, 0.03),
         (24_000, 250_000, 110, 0.015),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.
     chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_000, 400_000, 70, 0.035),)
     #: Spans of the spline along both axes in a stage with enough pixels; cells of the light along both axes for the transport;
-    #: pixels on which the lamp of a point is judged, that of a chip on a quarter of them.
+    #: pixels by which the uniformity of the light is judged.
     lamp_spans: int = 64
     lamp_cells: int = 44
-    lamp_pixels: int = 43_200
+    lamp_coarse: int = 2_700
 
     # Of the evaluation of a design, and of a render without a number of rays
 
@@ -185,7 +185,7 @@ TEST = replace(
     two_stages=((300, 5_000, 20, 0.1), (800, 10_000, 15, 0.02)),
     lamp_spans=16,
     lamp_cells=16,
-    lamp_pixels=2_400,
+    lamp_coarse=150,
     final_rays=40_000,
     bound_steps=400,
     cost_points=3,

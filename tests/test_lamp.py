@@ -7,11 +7,22 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import brentq
+from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.lamp import LampObjective, design_lamp, directions_of, field_of, pixels_of, refined, wanted
+from caustic_cli.inverse.lamp import (
+    Folds,
+    LampObjective,
+    design_lamp,
+    directions_of,
+    field_of,
+    judged_pixels,
+    pixels_of,
+    refined,
+    wanted,
+)
 from caustic_cli.inverse.lamp_limits import chip_limits, etendue_limit, least_error
 from caustic_cli.inverse.refractor_transport import envelope, source_directions
 from caustic_cli.optics.lamp import PointGrid, chip_grids, concentric, emissions, land, least_wall, through, through_point
@@ -392,6 +403,27 @@ def test_two_surfaces_pass_more_light_than_one_and_keep_their_limits():
     assert float(cKDTree(inner).query(outer, distance_upper_bound=2.0)[0].min()) >= 1.5
 
 
+def test_folded_light_lacks_and_its_lack_is_differentiable():
+    goal, lamp = Goal((100.0, 60.0)), Lamp(inner=3.0, surfaces=2)
+    folds = Folds(lamp, goal, FIELD)
+    even = torch.stack([FIELD.sphere(4.0), FIELD.sphere(12.0)])  # of light that goes straight on
+    assert float(folds.lack(even)) < 1e-12
+    values = even.clone()
+    values[1] = bumpy(height=0.02)
+    assert float(folds.lack(values)) > 1e-6
+    light = folds.through(folds.rays, values)  # another sign of folds: neighbours along u land in the other order
+    x, _, _ = land(goal, light)
+    rows = torch.full(folds.rays.shape, math.nan, dtype=torch.float64)
+    rows.view(-1)[folds.rays.lit] = x
+    assert bool((rows.diff(dim=0) < 0).any())
+    by = torch.randn(values.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
+    start = values.clone().requires_grad_()
+    (g,) = torch.autograd.grad(folds.lack(start), start)
+    steps = [1e-4 * 0.5**k for k in range(5)]
+    remainders = [abs(float((folds.lack(values + h * by) - folds.lack(values)).detach() - h * (g * by).sum())) for h in steps]
+    assert 1.8 < np.polyfit(np.log(steps), np.log(remainders), 1)[0] < 2.2
+
+
 # Gradients
 
 
@@ -436,6 +468,12 @@ def test_a_net_of_more_spans_is_the_same_surface():
     values, (u, v) = torch.stack([bumpy(coarse), bumpy(coarse, seed=3)]), 1.8 * random(2, 50) - 0.9
     for one, other in zip(values, refined(coarse, values, fine), strict=True):
         torch.testing.assert_close(torch.stack(coarse.at(one, u, v)), torch.stack(fine.at(other, u, v)), rtol=0, atol=1e-12)
+
+
+def test_a_lamp_is_judged_on_pixels_half_as_wide_as_those_refined():
+    goal = Goal((30_000.0, 10_000.0), 8000.0)
+    for lamp, (across, along) in ((Lamp(), (268, 90)), (Lamp(Chip("disc", (1.0, 1.0))), (95, 32))):
+        assert judged_pixels(lamp, goal, STANDARD) == (2 * across, 2 * along)
 
 
 def test_the_edges_that_a_chip_blurs_count_little():
@@ -542,6 +580,23 @@ def test_the_error_of_fine_shades_is_bounded_behind_the_blur_of_a_chip():
     small, large = (least_error(Lamp(Chip("disc", (s, s))), goal, stripes, 400) for s in (0.3, 3.0))
     assert small < 0.01 and 0.2 < large < 0.72  # of two shades 1.2 and 0.2 the standard deviation is 0.71
     words = list(chip_limits(Lamp(Chip("rectangle", (2.0, 2.0))), goal, stripes, 200))
-    assert len(words) == 2 and "blurs the picture by 1067 mm" in words[0] and "of less than 0." in words[1]
+    assert len(words) == 3 and "blurs the picture by 1067 mm" in words[0] and "of less than 0." in words[1]
     assert "by etendue, at most 35%" in list(chip_limits(Lamp(Chip("disc", (4.0, 4.0))), Goal((8.0, 8.0)), np.ones((2, 2)), 9))[1]
     assert list(chip_limits(Lamp(), goal, stripes, 9)) == []
+
+
+def test_sharp_edges_cost_light_behind_the_blur_of_a_chip():
+    """The bound of a uniform picture: none if light may fall beside it, and less than the error of any blurred picture."""
+    goal, lamp, square = Goal((30_000.0, 10_000.0), 8000.0), Lamp(Chip("rectangle", (3.0, 3.0)), inner=3.0), np.ones((2, 2))
+    free, little, none = (least_error(lamp, goal, square, 300, beside) for beside in (math.inf, 0.01, 0.002))
+    assert free < 1e-3 and 0.05 < little <= none
+    pixels, blur = pixels_of(goal, 3000), 0.5 * lamp.blur(goal)
+    x, y = ((np.arange(n) + 0.5) / n * s - s / 2 for n, s in zip(pixels, goal.size, strict=True))
+    kernel = (np.hypot(x[:, None], y[None, :]) <= blur).astype(float)
+    for shrunk in (0.0, 0.5, 1.0):  # an even picture without a border of so many radii of the blur, blurred
+        inside = (abs(x) < goal.size[0] / 2 - shrunk * blur)[:, None] & (abs(y) < goal.size[1] / 2 - shrunk * blur)
+        full = fftconvolve(inside.astype(float), kernel)
+        low = [(f - n) // 2 for f, n in zip(full.shape, pixels, strict=True)]
+        seen = full[low[0] : low[0] + pixels[0], low[1] : low[1] + pixels[1]]
+        beside = max(0.0, full.sum() / seen.sum() - 1.0)
+        assert float((seen / seen.mean()).std()) > least_error(lamp, goal, square, 300, beside + 1e-6)

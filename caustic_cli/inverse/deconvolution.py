@@ -13,7 +13,8 @@ all K, for any x, and with the Cauchy-Schwarz inequality and nu less its mean, w
 
     |y - b| >= (nu . b - N t) / |nu|
 
-which is tight for nu = b + c - y at the optimum.
+which is tight for nu = b + c - y at the optimum.  If no more light than s may fall beside the screen, relative to that on it, then
+for every price m > 0 of such light t is max_i ((K^T S^T nu)_i - m (1 - w_i)) / w_i, and N m s more is subtracted.
 """
 
 from __future__ import annotations
@@ -82,17 +83,23 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int) -> Deconvol
     return Deconvolved(light, tuple(n // cut for n in spread.beside), least, bound, kept)
 
 
-def error_bound(target: np.ndarray, spreads: Sequence[Convolution], most: int) -> float:
+def error_bound(
+    target: np.ndarray, spreads: Sequence[Convolution], most: int, price: float = 0.0, beside: float = math.inf
+) -> float:
     """Lower bound of the relative RMS error of any sum of irradiances, each blurred by one of these.
 
-    target: as of `deconvolved`; most: iterations, of which large pictures get fewer.
+    Args:
+        target: as of `deconvolved`.
+        most: iterations, of which large pictures get fewer.
+        price, beside: most light beside the screen, relative to that on it, and the price of it that is tried, see the module; the
+            largest bound of several prices is the tightest.
     """
     b = torch.from_numpy(target / target.mean())
     steps = int(min(most, max(BOUND_STEPS, BOUND_WORK / sum(_cells(b, spread).numel() for spread in spreads))))
     least, bound = math.inf, 0.0
-    for k, (x, c) in enumerate(itertools.islice(_iterates(b, spreads, LEAST_REACH), steps), 1):
+    for k, (x, c) in enumerate(itertools.islice(_iterates(b, spreads, LEAST_REACH, price), steps), 1):
         if k % LOOK == 0 or k == steps:
-            error, below = _error_and_bound(b, x, c, spreads)
+            error, below = _error_and_bound(b, x, c, spreads, price, beside if price > 0.0 else 0.0)
             least, bound = min(least, error), max(bound, below)
             if _tight(least, bound):
                 break
@@ -104,11 +111,13 @@ def _tight(error: float, bound: float) -> bool:
     return bound > (1.0 - TIGHT) * error or error < NO_ERROR
 
 
-def _iterates(b: Tensor, spreads: Sequence[Convolution], least: float = 1.0) -> Iterator[tuple[list[Tensor], float]]:
+def _iterates(
+    b: Tensor, spreads: Sequence[Convolution], least: float = 1.0, price: float = 0.0
+) -> Iterator[tuple[list[Tensor], float]]:
     """x of each blur and c after each iteration for a picture b (n, m) of mean 1.
 
     least: of the divisor w of the steps, in whose metric they are gradients: 1 leaves little light around the screen, less than 1
-    converges sooner there.
+    converges sooner there; price: of light beside the screen.
     """
     count = len(spreads)
     reach = [_back(torch.ones_like(b), spread) for spread in spreads]
@@ -118,7 +127,7 @@ def _iterates(b: Tensor, spreads: Sequence[Convolution], least: float = 1.0) -> 
     while True:
         y = _seen(ahead, spreads)
         moved = [
-            torch.where(r > REACHES, (a + _back(b + c - y, spread) / (count * w)).clamp_min(0.0), 0.0)
+            torch.where(r > REACHES, (a + (_back(b + c - y, spread) - price * (1.0 - r)) / (count * w)).clamp_min(0.0), 0.0)
             for a, spread, r, w in zip(ahead, spreads, reach, metric, strict=True)
         ]
         c += 0.5 * (1.0 - float(y.mean()))
@@ -130,7 +139,9 @@ def _iterates(b: Tensor, spreads: Sequence[Convolution], least: float = 1.0) -> 
         yield x, c
 
 
-def _error_and_bound(b: Tensor, x: list[Tensor], c: float, spreads: Sequence[Convolution]) -> tuple[float, float]:
+def _error_and_bound(
+    b: Tensor, x: list[Tensor], c: float, spreads: Sequence[Convolution], price: float = 0.0, beside: float = 0.0
+) -> tuple[float, float]:
     """Relative RMS error of the blurred irradiances x, and the lower bound by their nu."""
     y = _seen(x, spreads)
     y = y / y.mean()
@@ -139,8 +150,8 @@ def _error_and_bound(b: Tensor, x: list[Tensor], c: float, spreads: Sequence[Con
     for spread in spreads:
         reach = _back(torch.ones_like(b), spread)
         near = reach > REACHES
-        most = max(most, float((_back(nu, spread)[near] / reach[near]).max()))
-    above, size = float((nu * b).sum()) - b.numel() * most, float(nu.norm())
+        most = max(most, float(((_back(nu, spread) - price * (1.0 - reach))[near] / reach[near]).max()))
+    above, size = float((nu * b).sum()) - b.numel() * (most + price * beside), float(nu.norm())
     return error, above / (size * math.sqrt(b.numel())) if above > 0.0 and size > 0.0 else 0.0
 
 

@@ -47,6 +47,8 @@ DEGREE = 3
 #: Points of a grid at which limits of two surfaces hold, weight of their squares, the wall there over that to be kept, and the
 #: greatest radius over that there.
 LIMIT_POINTS, STIFF, SAFE, WITHIN = 8000, 10.0, 1.1, 1.02
+#: Points of the grid at whose cells light must not fold, least area of a cell on the target over that for its light, and weight.
+FOLD_POINTS, LEAST_AREA, FOLDED = 18_000, 0.2, 0.02
 #: Radius of the first inner surface, a sphere, over its least one.
 BEGIN = 4.0 / 3.0
 
@@ -98,13 +100,13 @@ class LampObjective:
         self.through = partial(through_point if point else through, lamp, field)
         self.screen = Screen(goal.size, resolution=(target.shape[0], target.shape[1])).grown((APRON, APRON))
         smooth = FILTER.smooth(torch.nn.functional.pad(target.double(), (APRON,) * 4))
-        self.inside = torch.nn.functional.pad(torch.ones_like(target), (APRON,) * 4, value=float(point))
+        self.inside = torch.nn.functional.pad(torch.ones_like(target), (APRON,) * 4)
         self.seen = torch.ones_like(smooth) if point else self._interior(lamp, target)
         self.target = smooth / (smooth * self.seen).sum()
         self.weights = self.seen + BLURRED * (1.0 - self.seen)
         self.lit = float((target > 0).sum()) if point else float(((smooth > 0) & (self.seen > 0)).sum())
         self.splat = backend_for("cpu").splat
-        self.limits = SurfaceLimits(lamp, field) if lamp.surfaces == 2 else None
+        self.limits = SurfaceLimits(lamp, goal, field) if lamp.surfaces == 2 else None
 
     def _interior(self, lamp: Lamp, target: Tensor) -> Tensor:
         """1 on the pixels of the grown screen without a border of the target."""
@@ -137,13 +139,13 @@ class LampObjective:
 
 class SurfaceLimits:
     """Limits of two free-form surfaces, at the points of a grid: a wall between them, estimated by the radial distance and the
-    slopes, the least radius of the inner one, and the greatest of the outer one."""
+    slopes, the least radius of the inner one, and the greatest of the outer one; and that their light does not fold."""
 
-    def __init__(self, lamp: Lamp, field: PolarField):
-        self.lamp, self.grids = lamp, PointGrid.of(field, LIMIT_POINTS)
+    def __init__(self, lamp: Lamp, goal: Goal, field: PolarField):
+        self.lamp, self.grids, self.folds = lamp, PointGrid.of(field, LIMIT_POINTS), Folds(lamp, goal, field)
 
     def lack(self, values: Tensor) -> Tensor:
-        """Sum of squares of what lacks, relative to each limit, per point, times STIFF."""
+        """Sum of squares of what lacks, relative to each limit, per point, times STIFF; and `Folds`."""
         total, count, lamp = torch.zeros((), dtype=torch.float64), 0, self.lamp
         for grid in self.grids:
             hits = [grid.hits(net) for net in values]
@@ -153,7 +155,40 @@ class SurfaceLimits:
             lacks = (1.0 - wall / (SAFE * lamp.wall), 1.0 - inner / lamp.inner, WITHIN * outer / lamp.radius - 1.0)
             total = total + sum((lack.clamp_min(0.0) ** 2).sum() for lack in lacks)
             count += len(inner)
-        return STIFF / count * total
+        return STIFF / count * total + self.folds.lack(values)
+
+
+class Folds:
+    """Whether the light of the chip's centre folds, at the cells of a grid.
+
+    Two surfaces can send all light to the target without folds.  Where it folds, which pays a little at the rim of the light, the
+    edges of the folds are bright lines narrower than pixels: the error on pixels half as wide was 0.012 with folds and 0.006
+    without (30 x 10 m from 8 m).
+    """
+
+    def __init__(self, lamp: Lamp, goal: Goal, field: PolarField):
+        (self.rays,) = PointGrid.of(field, FOLD_POINTS, lamp.chip.centre)
+        self.goal, self.through = goal, partial(through_point, replace(lamp, chip=lamp.chip.centre), field)
+        number = torch.full(self.rays.shape, -1)
+        number.view(-1)[self.rays.lit] = torch.arange(len(self.rays.lit))
+        corners = torch.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], 2).view(-1, 4)
+        self.corners = corners[(corners >= 0).all(1)]
+        self.power = self.rays.power[self.corners].mean(1)
+
+    def lack(self, values: Tensor) -> Tensor:
+        """Mean over the power of how far the area of each cell on the target, over that for its light, is below LEAST_AREA; areas
+        of folded cells are negative."""
+        light = self.through(self.rays, values)
+        x, y, ahead = land(self.goal, light)
+        passed = torch.where(ahead, light.power, torch.zeros_like(x))
+        (x0, x1, x2, x3), (y0, y1, y2, y3), power = (
+            x[self.corners].unbind(1),
+            y[self.corners].unbind(1),
+            passed[self.corners],
+        )
+        area = 0.5 * ((x2 - x0) * (y3 - y1) - (x3 - x1) * (y2 - y0)) / math.prod(self.goal.size)
+        lack = (LEAST_AREA - area * passed.sum() / power.mean(1).clamp_min(1e-12)).clamp_min(0.0)
+        return FOLDED * (torch.where((power > 0).all(1), self.power, torch.zeros_like(lack)) * (lack * lack / (1.0 + lack))).sum()
 
 
 def refine(
@@ -216,6 +251,12 @@ def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Lamp, tuple[int, int, in
     if lamp.chip.shape == "point":
         return found
     return [*found[:-1], *((lamp, stage) for stage in effort.chip_stages)]
+
+
+def judged_pixels(lamp: Lamp, goal: Goal, effort: Effort) -> tuple[int, int]:
+    """Pixels on which a lamp is judged: half as wide along both axes as those of the last stage, which show what the design saw."""
+    across, along = pixels_of(goal, stages_of(lamp, effort)[-1][1][0])
+    return 2 * across, 2 * along
 
 
 def design_lamp(

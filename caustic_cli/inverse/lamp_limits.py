@@ -23,6 +23,10 @@ from caustic_cli.scene.lamp import Goal, Lamp
 
 #: Pixels of the target.
 PIXELS = 3000
+#: Part of the light on the picture up to which light beside it is allowed where its edges count, and prices of it that are tried.
+BESIDE, PRICES = 0.01, (0.1, 0.2, 0.4)
+#: Least error of this kind that is told.
+LEAST_TOLD = 0.01
 
 
 def etendue_limit(lamp: Lamp, goal: Goal) -> float:
@@ -41,17 +45,21 @@ def etendue_limit(lamp: Lamp, goal: Goal) -> float:
     return float((solid * 0.5 * math.pi * lamp.radius**2 * (1.0 + cosine)).sum()) / (math.pi * area)
 
 
-def least_error(lamp: Lamp, goal: Goal, picture: np.ndarray, most: int) -> float:
+def least_error(lamp: Lamp, goal: Goal, picture: np.ndarray, most: int, beside: float = math.inf) -> float:
     """Lower bound of the relative RMS error of a picture behind the chip's blur, on PIXELS pixels.
 
-    picture: as of `inverse.lamp.wanted`; most: iterations.
+    Args:
+        picture: as of `inverse.lamp.wanted`.
+        most: iterations.
+        beside: light that may fall beside it, relative to that on it: sharp edges cost light.
     """
     pixels = pixels_of(goal, PIXELS)
     pixel = (goal.size[0] / pixels[0], goal.size[1] / pixels[1])
     half = 0.5 * lamp.blur(goal) * min(lamp.chip.size) / max(lamp.chip.size)
     blur = Spread((half, half), ((0.0, 0.0, 1.0),), 0.0)
     density = wanted(goal, picture, pixels).numpy() / goal.shares(pixels)
-    return error_bound(density, [blur.on(pixel, FINEST)], most)
+    prices = (0.0,) if math.isinf(beside) else PRICES
+    return max(error_bound(density, [blur.on(pixel, FINEST)], most, price, beside) for price in prices)
 
 
 def chip_limits(lamp: Lamp, goal: Goal, picture: np.ndarray, most: int) -> Iterator[str]:
@@ -64,3 +72,8 @@ def chip_limits(lamp: Lamp, goal: Goal, picture: np.ndarray, most: int) -> Itera
         yield f"behind this blur, no picture has a relative RMS error of less than {at_most(error, 3)}"
     if (part := etendue_limit(lamp, goal)) < 1.0:
         yield f"by etendue, at most {part:.0%} of the light can reach the picture through a lens of this radius"
+    elif (error := least_error(lamp, goal, picture, most, BESIDE)) > LEAST_TOLD:
+        yield (
+            f"with its edges, no picture has one of less than {at_most(error, 2)} unless more than {BESIDE:.0%} of the light falls"
+            " beside it"
+        )

@@ -185,7 +185,8 @@ class PointGrid:
     The coordinates of equispaced s are u = tan(a s) / tan(a): denser about the axis, where most of the light is, so that rays are
     of less unequal power.
 
-    u, v: (N,) coordinates of the directions; power: (N,), of sum 1 over all rows.
+    u, v: (N,) coordinates of the directions; power: (N,), of sum 1 over all rows; shape: of the grid with its corners, lit: (N,)
+    which of its points have light, row by row.
     """
 
     def __init__(self, field: PolarField, sample: Sample, chip: Chip):
@@ -194,6 +195,7 @@ class PointGrid:
         sample = replace(sample, u=0.5 * (u + 1.0), v=0.5 * (v + 1.0))
         stretch = torch.outer(*(1.0 / torch.cos(DENSER * c) ** 2 for c in (s, t))).reshape(-1)
         u, v = torch.meshgrid(u, v, indexing="ij")
+        self.shape = tuple(u.shape)
         self.lit = (u * u + v * v < 1.0).reshape(-1).nonzero()[:, 0]
         self.u, self.v = u.reshape(-1)[self.lit], v.reshape(-1)[self.lit]
         self.power = emitted(chip, self.u, self.v) * stretch[self.lit]

@@ -18,8 +18,8 @@ from caustic_cli.scene.lamp import Goal
 
 #: Pixels of the picture, and part of the greatest intensity that counts as light.
 PIXELS, DARK = 60_000, 0.005
-#: Steps between the angles of a file.
-FINER = 6
+#: Steps between the angles of a file, an odd number, and iterations towards its values as means over cells.
+FINER, ROUNDS = 7, 8
 
 
 def angles_of(light: Photometry, projection: str = "latitude") -> tuple[float, float]:
@@ -39,8 +39,38 @@ def angles_of(light: Photometry, projection: str = "latitude") -> tuple[float, f
         radius, back, *_ = anglemap.RADIAL[projection]
         coordinates = back(radius(gamma) * abs(np.cos(plane))), back(radius(gamma) * abs(np.sin(plane)))
     width, height = (2.0 * math.degrees(float(np.abs(angle[lit]).max())) for angle in coordinates)
-    least, most = 2.0 * float(light.angles[1] - light.angles[0]), anglemap.widest_of(projection)
-    return min(max(width, least), most), min(max(height, least), most)
+    step, most = float(light.angles[1] - light.angles[0]), anglemap.widest_of(projection)
+    return min(width + 2.0 * step, most), min(height + 2.0 * step, most)  # light ends within a step beyond the last lit angle
+
+
+def as_means(light: Photometry) -> Photometry:
+    """The light, `refined`, with the values of a file as means over their cells, which reach half a step to all sides, as of those
+    that are counted from rays (`studies.photometry`): otherwise every passage through a file blurs edges by a cell.
+
+    The values are corrected by what the means deviate, ROUNDS times, and in the end scaled cell by cell, by nearly 1 unless there
+    is an edge, whose dark side the interpolation would light.
+    """
+    planes = len(light.planes)
+    found, corrected = refined(light), light.values
+    for _ in range(ROUNDS):
+        corrected = (light.values + corrected - means(found, planes)).clip(0.0)
+        found = refined(light._replace(values=corrected))
+    scale = light.values / means(found, planes).clip(max(1e-9 * float(light.values.max()), 1e-300))
+    return found._replace(values=found.values * over_cells(scale))
+
+
+def means(finely: Photometry, planes: int) -> np.ndarray:
+    """Of refined light over the cells of its nodes, (planes, angles)."""
+    half = FINER // 2
+    weight = np.sin(np.radians(finely.angles)).clip(1e-9)
+    power, area = (np.pad(c, ((0, 0), (half, half))) for c in (np.roll(finely.values, half, 0) * weight, weight[None]))
+    return power.reshape(planes, FINER, -1, FINER).sum((1, 3)) / area.reshape(1, 1, -1, FINER).sum((1, 3)) / FINER
+
+
+def over_cells(values: np.ndarray) -> np.ndarray:
+    """Values (planes, angles) of nodes at all refined angles of their cells."""
+    half = FINER // 2
+    return np.roll(values.repeat(FINER, 0), -half, 0).repeat(FINER, 1)[:, half:-half]
 
 
 def refined(light: Photometry) -> Photometry:
@@ -61,7 +91,7 @@ def picture_of(light: Photometry, goal: Goal) -> np.ndarray:
     """
     pixels = pixels_of(goal, PIXELS)
     directions = directions_of(goal, pixels).numpy()
-    found = refined(light).intensity(directions).clip(0.0) * (1.0 if goal.far else directions[:, 2] ** 3)
+    found = as_means(light).intensity(directions).clip(0.0) * (1.0 if goal.far else directions[:, 2] ** 3)
     if not found.any():
         raise InputError("has no light on the target")
     return found.reshape(pixels)

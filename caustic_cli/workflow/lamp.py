@@ -26,7 +26,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.lamp_mitsuba import FINE, plane_of, write_lamp_mitsuba
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
-from caustic_cli.inverse.lamp import design_lamp, field_of, pixels_of, refuse_thin, stages_of, wanted
+from caustic_cli.inverse.lamp import design_lamp, field_of, judged_pixels, pixels_of, refuse_thin, stages_of, wanted
 from caustic_cli.inverse.lamp_limits import chip_limits
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
@@ -114,9 +114,8 @@ class LampDesign:
         """The light by independent rays; rays: None for those of the evaluation of a design."""
         effort = current_effort()
         rays = rays or effort.final_rays
-        finest = effort.lamp_pixels if self.lamp.chip.shape == "point" else effort.lamp_pixels // 4  # of what it does not blur
-        counts = finest, effort.lamp_pixels // 16
-        fine, coarse = (wanted(self.goal, self.picture, pixels_of(self.goal, count)).numpy() for count in counts)
+        pixels = [judged_pixels(self.lamp, self.goal, effort), pixels_of(self.goal, effort.lamp_coarse)]
+        fine, coarse = (wanted(self.goal, self.picture, n).numpy() for n in pixels)
         shaded = len(np.unique(self.picture[self.picture > 0])) > 1
         intensities = IntensitySum()
         how: dict[str, Any] = {"shaded": shaded, "rays": rays, "seed": seed, "also": intensities.add}
@@ -417,7 +416,7 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         found.append(("upper edge", f"{figures['cut_off']:.2f} degrees from 90 % to 10 % of the intensity beneath it"))
     found += [
         ("least wall", f"{figures['least_wall']:.3g} mm; greatest radius {figures['greatest_radius']:.4g} mm"),
-        ("rays", f"{figures['rays']:,} on {width} x {height} pixels"),
+        ("rays", f"{figures['rays']:,} on {width} x {height} pixels, half as wide as those refined; their noise is subtracted"),
         ("iterations", number("iterations", "d")),
         ("time", f"{figures['seconds']:.1f} s"),
     ]
