@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -67,7 +68,7 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
     lens = LensSettings(given.get("lens", {}))
     lens = lens if {"index", "glass"} & {*lens} else lens.filled(glass=MATERIAL)
     target, screen = TargetSettings(given.get("target", {})), ScreenSettings()
-    far = by.get("screen_place")
+    far = "far" if by.get("throw") == math.inf else by.get("screen_place")
     if far not in (None, "far"):
         raise InputError(f"⟨screen_place⟩ of a lamp must be far, or be left out for a screen at ⟨+throw⟩, got {far}")
     if lamp.angles is None:
@@ -83,7 +84,7 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
         screen = ScreenSettings({**given.get("screen", {}), "z": z})
         check("target.size", target.size)
         check("screen.shift", screen.shift)
-    elif "picture_size" in by or "size" in target or "throw" in by or given.get("screen", {}):
+    elif "picture_size" in by or "size" in target or by.get("throw", math.inf) < math.inf or given.get("screen", {}):
         raise InputError(
             "⟨lamp.angles⟩ places the picture in the far field: leave out its distance, its size and its shift on a screen"
         )
