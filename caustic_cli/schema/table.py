@@ -213,7 +213,8 @@ class SourceSettings(Section):
         return self.get("also", ())
 
     type: str = setting("plane: collimated light along +z over the aperture; point; grid of points; disc, an extended source; rays,"
-            " a ray file; gaussian, the beam of a laser", default="plane", why="the thesis' first source, section 4.2.1",
+            " a ray file; gaussian, the beam of a laser; measured, a beam by its phase", default="plane", why="the thesis' first"
+            " source, section 4.2.1",
             option=Option("--source", commands=BOTH))
     power: float = setting("total power of the source, through the aperture or into the cone; in lm, images are in lux", "W", 0.0,
             checks.POWER, above=True, default=1.0, why="images are fractions of the source's power",
@@ -221,9 +222,12 @@ class SourceSettings(Section):
     power_unit: str = setting("W, or lm for images in lux", choices=("W", "lm"), default="W", written=False)
     profile: str | None = setting("plane: file in this directory with the relative irradiance over the aperture", file="profile")
     file: str | None = setting("ray file (IES TM-25 .tm25ray, Zemax .dat or .sdf, LightTools .ray or .txt), of which the project"
-            " keeps a copy; for a disc, a picture of its brightness, for a plane wave one of its irradiance over the aperture, such"
-            " as that of a measured beam, both with linear values",
+            " keeps a copy; for a disc, a picture of its brightness, for a plane wave or a measured beam one of the irradiance over"
+            " the aperture, all with linear values",
             option=Option("--source-file", "FILE", BOTH), file="source")
+    phase_file: str | None = setting("measured: file of the phase over the aperture, in rad at the wavelength, not wrapped, which"
+            " increases along the light; a 2-D .npy [i, j], of which the project keeps a copy",
+            option=Option("--source-phase", "FILE", BOTH), file="phase")
     position: Points | None = setting("point: one or several [x, y, z]; grid, disc: the centre; rays: the file's origin", "mm",
             *DISTANCE, derived="on the axis, five lens widths in front of the lens",
             option=Option("--source-position", "X,Y,Z", BOTH))
