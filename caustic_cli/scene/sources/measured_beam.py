@@ -163,14 +163,14 @@ class _Cubic:
 
     def at(self, u: np.ndarray, v: np.ndarray) -> list[np.ndarray]:
         """Value, and derivatives by u and by v, at points; linear beyond the cells."""
-        inside = [np.clip(c, -1.0, 1.0) for c in (u, v)]
+        a, b = np.clip(u, -1.0, 1.0), np.clip(v, -1.0, 1.0)
         found = []
         for order in ((0, 0), (1, 0), (0, 1)):
             terms = self.terms
             for axis, k in enumerate(order):
                 terms = np.polynomial.polynomial.polyder(terms, k, axis=axis) if k else terms
-            found.append(np.polynomial.polynomial.polyval2d(*inside, terms) + self._spline(*inside, order))
-        found[0] = found[0] + found[1] * (u - inside[0]) + found[2] * (v - inside[1])
+            found.append(np.polynomial.polynomial.polyval2d(a, b, terms) + self._spline(a, b, order))
+        found[0] = found[0] + found[1] * (u - a) + found[2] * (v - b)
         return found
 
     def _spline(self, u: np.ndarray, v: np.ndarray, order: tuple[int, int]) -> np.ndarray:
