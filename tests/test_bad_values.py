@@ -29,7 +29,7 @@ DESIGN = [
     ("--degree 0", "--degree must be whole numbers of at least 1"),
     ("--degree 20", "--degree must be a whole number 1 to 15, got 20"),
     ("--quality fien", "--quality must be one of draft, standard, fine, got 'fien'"),
-    ("--source plan", "--source must be one of plane, point, grid, disc, gaussian, rays, got 'plan'"),
+    ("--source plan", "--source must be one of plane, point, grid, disc, gaussian, measured, rays, got 'plan'"),
     ("--loss rsm", "--loss must be names with weights"),
     ("--optimizer sgd", "--optimizer must be one of lbfgs, adam"),
     ("--glass N-BK8", "--glass must be one of"),

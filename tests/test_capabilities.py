@@ -101,6 +101,7 @@ SCENES: dict[str, Scene] = {
     "tilted screen": screen(tilt=(10.0, 0.0)),
     "shifted screen": screen(shift=(3.0, 0.0)),
     "curved screen": screen(sags=Sags(np.zeros((4, 4)), PLAIN.screen.size)),
+    "far field": screen(far=True),
     "several sources": of(Several((PlaneWave(), PlaneWave(2.0)), (NONE, NONE))),
     "sources at once": of(Several((PlaneWave(), PlaneWave(2.0)), (NONE, NONE))),
     "ray file": of(FILE),

@@ -88,7 +88,16 @@ def test_irradiance_is_power_over_area():
     image[:4, :2] = 1.0 / 8.0
     assert irradiance_figures(scene, image) == pytest.approx({"peak_irradiance": 100.0 / 2e-6, "mean_irradiance": 100.0 / 8e-6})
     words = unit_figures(scene)
-    assert words == {"power": 100.0, "power_unit": "lm", "irradiance_unit": "lux", "fractions_of": "the power through the aperture"}
+    assert words == {
+        "power": 100.0,
+        "power_unit": "lm",
+        "screen_unit": "mm",
+        "irradiance_unit": "lux",
+        "fractions_of": "the power through the aperture",
+    }
+    far = replace(scene, screen=replace(scene.screen, z=1000.0, far=True))
+    assert unit_figures(far)["irradiance_unit"] == "cd" and unit_figures(far)["screen_unit"] == "mrad"
+    assert irradiance_figures(far, image)["peak_irradiance"] == pytest.approx(100.0 / 2e-6)  # 2 mrad^2 are 2e-6 sr
     near = replace(scene, source=Points(((0.0, 0.0, -20.0),), cone=30.0))
     assert unit_figures(near)["fractions_of"] == "the power within the cone of 30 degrees"
     in_watts = Scene(Disc(power=3.0), Lens(), scene.screen)

@@ -226,14 +226,16 @@ def test_sources_without_their_extent():
 
 
 def test_the_types_and_their_keys():
-    assert sources.names() == ("plane", "point", "grid", "disc", "gaussian", "rays")
+    assert sources.names() == ("plane", "point", "grid", "disc", "gaussian", "measured", "rays")
     assert sources.used_by("position") == ("point", "grid", "disc", "rays") and sources.used_by("profile") == ("plane",)
     assert sources.used_by("size") == ("grid", "disc") and sources.used_by("grid") == ("grid",)
     assert sources.used_by("polarisation") == ()  # of any light
     known = set(settings.SCHEMA["source"])
     for name in sources.names():
         assert {*sources.type_of(name).keys, *sources.COMMON} <= known
-    with pytest.raises(InputError, match=r"\[source\] type must be one of plane, point, grid, disc, gaussian, rays, got 'sun'"):
+    with pytest.raises(
+        InputError, match=r"\[source\] type must be one of plane, point, grid, disc, gaussian, measured, rays, got 'sun'"
+    ):
         sources.type_of("sun")
 
 

@@ -333,7 +333,10 @@ def _of_beam(figures: dict) -> list[tuple[str, str]]:
     return [
         ("error in the mask", f"{of['error']:.4f} of the picture there; peak to valley {of['peak_to_valley']:.4f}{zeros}"),
         ("light in the mask", f"{of['in_mask']:.2%} of that behind the lens; {of['in_region']:.2%} in the region"),
-        ("width of its edges", f"{of['edge_width']:.4g} mm, from 1/e² to 1 - 1/e² of the irradiance within"),
+        (
+            "width of its edges",
+            f"{of['edge_width']:.4g} {figures.get('screen_unit', 'mm')}, from 1/e² to 1 - 1/e² of the irradiance within",
+        ),
     ]
 
 

@@ -339,6 +339,29 @@ def _radius(option: str, text: str) -> dict[str, Any]:
     return {"screen.radius": both(tuple(radii))}
 
 
+def _extent(option: str, text: str) -> tuple[tuple[float, ...], dict[str, Any]]:
+    """A size on the screen, mm, or as an angle, mrad, which is one in the far field: "20mrad", "1degx2deg"; and what that sets."""
+    unit = next((name for name in ANGLES if text.strip().endswith(name)), None)
+    if unit is None:
+        return size(option, text), {}
+    return tuple(ANGLES[unit] * v for v in size(option, re.sub(f" ?{unit}", "", text))), {"screen.far": True}
+
+
+def _screen_size(option: str, text: str) -> dict[str, Any]:
+    values, far = _extent(option, text)
+    return {"screen_size": values} | far
+
+
+def _picture_size(option: str, text: str) -> dict[str, Any]:
+    values, far = _extent(option, text)
+    return {"picture_size": values} | far
+
+
+def _throw(option: str, text: str) -> dict[str, Any]:
+    form = "a number of mm, or with a unit, like 30cm or 4in, or inf for the far field"
+    return {"throw": numbers(option, text, (1,), unit="mm", form=form, endless=True)[0]}
+
+
 def _terms(option: str, text: str) -> dict[str, Any]:
     """Numbers separated by commas, one or more."""
     return {"lens.gradient_terms": list(numbers(option, text, (text.count(",") + 1,), ",", "numbers separated by commas"))}
@@ -395,8 +418,9 @@ READERS = {
     "room.place": _sun,
     "rays": lambda option, text: {"rays": rays(option, text)},
     "screen_place": lambda option, text: {"screen_place": _place(option, text)},
-    "screen_size": lambda option, text: {"screen_size": size(option, text)},
-    "picture_size": lambda option, text: {"picture_size": size(option, text)},
+    "screen_size": _screen_size,
+    "picture_size": _picture_size,
+    "throw": _throw,
     "resolution": lambda option, text: {"resolution": counts(option, text)},
 }
 #: Help of options that are more restricted than their setting.
@@ -417,8 +441,9 @@ HELP = {
 COMMON = {row.option.name.lstrip("-"): row for row in table.TABLE.values() if row.option and row.option.common}
 #: Least limit of the size of a file, bytes.
 LEAST_FILE = 10_000
-#: Units of length, mm.
+#: Units of length, mm, and of sizes in the far field, mrad.
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+ANGLES = {"mrad": 1.0, "deg": 1000.0 * math.radians(1.0)}
 
 
 def numbers(

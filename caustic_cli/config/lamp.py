@@ -78,7 +78,7 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
     elif "pitch" in lamp:
         raise InputError("⟨lamp.pitch⟩ belongs to an array of lamps, which ⟨+lens.array⟩ makes")
     target, screen = TargetSettings(given.get("target", {})), ScreenSettings()
-    far = by.get("screen_place")
+    far = "far" if by.get("throw") == math.inf else by.get("screen_place")
     if far not in (None, "far"):
         raise InputError(f"⟨screen_place⟩ of a lamp must be far, or be left out for a screen at ⟨+throw⟩, got {far}")
     if lamp.angles is None:
@@ -96,7 +96,7 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
         screen = ScreenSettings({**given.get("screen", {}), "z": z})
         check("target.size", target.size)
         check("screen.shift", screen.shift)
-    elif "picture_size" in by or "size" in target or "throw" in by or given.get("screen", {}):
+    elif "picture_size" in by or "size" in target or by.get("throw", math.inf) < math.inf or given.get("screen", {}):
         raise InputError(
             "⟨lamp.angles⟩ places the picture in the far field: leave out its distance, its size and its shift on a screen"
         )

@@ -118,7 +118,7 @@ def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping
         InputError: the place is not reached by the light, or the screen has two.
     """
     interaction, source = interaction_of(s.lens.mirror), build_source(s.source)
-    if by.screen_place is None:
+    if by.screen_place is None or s.screen.far:
         if not source.lean:
             return s.screen
         x, y, z = (abs(s.screen.z) / source.axis[2] * c for c in source.axis)

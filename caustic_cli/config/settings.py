@@ -516,6 +516,7 @@ def build_screen(screen: ScreenSettings) -> Screen:
         screen.shift,
         screen.radius or PLANE,
         None if sags is None else Sags(sags, screen.size),
+        far=screen.far,
     )
 
 

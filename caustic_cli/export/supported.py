@@ -21,11 +21,17 @@ SHAPE = (
     f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold its shape alone"
 )
 SOURCE = "⟨format⟩ {format} does not support sources of type {scene.source.kind}"
+SCREEN = (
+    "⟨format⟩ {format} has a screen at a distance, and this lens' picture is in the far field;"
+    f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold the lens alone"
+)
+#: Of BEYOND_CLEAR, what Mitsuba's files hold, and what has a message of its own.
+HELD = ("mirror", "gradient index", "tilted screen", "shifted screen", "far field")
 
 #: Beyond what ONE_INDEX and TWO_SIDED say.
 _UNSUPPORTED: dict[str, Mapping[str, str]] = {
-    "zemax": {"other elements": ONE_LENS},
-    "lighttools": {"user-defined source": SOURCE},
+    "zemax": {"other elements": ONE_LENS, "far field": SCREEN},
+    "lighttools": {"user-defined source": SOURCE, "far field": SCREEN},
     "phase": {
         **dict.fromkeys(
             ("mirror", "gradient index", "other elements", "folded axis", "two sides", "several sources"),
@@ -34,8 +40,9 @@ _UNSUPPORTED: dict[str, Mapping[str, str]] = {
         **dict.fromkeys(("ray file", "curved screen"), "⟨format⟩ phase needs a wave image, which there is none of with {}"),
     },
     "mitsuba": {
+        "far field": SCREEN,
         **dict.fromkeys(
-            [name for name in BEYOND_CLEAR if name not in ("mirror", "gradient index", "tilted screen", "shifted screen")],
+            [name for name in BEYOND_CLEAR if name not in HELD],
             "⟨format⟩ mitsuba is written for clear lenses and plane screens, not {}",
         ),
         **dict.fromkeys(("ray file", "several sources", "user-defined source"), SOURCE),
@@ -68,6 +75,7 @@ SCRIPT = Capability(
         **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
         **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
         "gradient index": SHAPE,
+        "far field": SCREEN,
         "tilted light": "⟨script⟩: its source shines along the axis, so light at an angle, which the archive alone holds, cannot be"
         " written",
         "lumens": "⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written",

@@ -48,6 +48,7 @@ from caustic_cli.scene.traits import Capability
 INDEX_DESIGN = Capability(
     "design of a gradient index",
     {
+        "far field": "⟨lens.gradient⟩ free is designed for a screen at a distance, not for ⟨+throw⟩ inf",
         "light not parallel": "⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane",
         **dict.fromkeys(
             ("mirror", "coloured picture"), "⟨lens.gradient⟩ free is designed for lenses, and for pictures without colours"

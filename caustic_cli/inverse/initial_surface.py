@@ -22,7 +22,7 @@ from torch import Tensor
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident, lit_rectangle
-from caustic_cli.inverse.projection import BeamProjection, CrossedProjection, ScreenProjection, seen_by_light
+from caustic_cli.inverse.projection import CrossedProjection, ScreenProjection, projection_of, seen_by_light
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scattered import Pixels
 from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
@@ -171,20 +171,11 @@ class _Grid:
 
     def projection(self, mean: float) -> Projection | None:
         """Projection of the screen for a surface of this mean height; None for an upright plane screen without a crossing."""
-        found, lens = self._uncrossed(mean), self.scene.lens
+        scene, lens = self.scene, self.scene.lens
+        found = RelayedScreen(scene, mean) if scene.behind else projection_of(scene, mean)
         if not lens.crossing:
             return found
-        return CrossedProjection(found or ScreenProjection(self.scene.screen, mean, lens.interaction.side), found is None)
-
-    def _uncrossed(self, mean: float) -> Projection | None:
-        """The same for light that does not cross over."""
-        screen = self.scene.screen
-        if self.scene.behind:
-            return RelayedScreen(self.scene, mean)
-        source, side = self.scene.source, self.scene.lens.interaction.side
-        if source.oblique:
-            return BeamProjection(screen, mean, side, source.axis)
-        return None if screen.upright else ScreenProjection(screen, mean, side)
+        return CrossedProjection(found or ScreenProjection(scene.screen, mean, lens.interaction.side), found is None)
 
     def above(self, z: np.ndarray) -> np.ndarray:
         """Fraction of the corners of each cell where the surface is not truncated."""

@@ -40,7 +40,11 @@ NEEDS_DISTANT_SOURCE = (
 )
 LENSLETS = Capability(
     "lenslet arrays",
-    {"near source": NEEDS_DISTANT_SOURCE, "laser beam": "⟨lens.array⟩ would give each lenslet a beam of its own"},
+    {
+        "near source": NEEDS_DISTANT_SOURCE,
+        "laser beam": "⟨lens.array⟩ would give each lenslet a beam of its own",
+        "far field": "⟨lens.array⟩ is designed for a screen at a distance, not for ⟨+throw⟩ inf",
+    },
 )
 
 

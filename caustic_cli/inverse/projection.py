@@ -254,6 +254,45 @@ class CrossedProjection:
         return np.ascontiguousarray(power[::-1, ::-1]), half, (-x, -y)
 
 
+@dataclass(frozen=True, eq=False)
+class FarProjection(BeamProjection):
+    """Projection of the far field: onto direction cosines times its focal length, whatever the point of the lens."""
+
+    axial_scale = (0.0, 0.0)  # type: ignore[assignment]  # a constant instead of a property
+
+    @property
+    def distance(self) -> float:
+        """R, the focal length, mm."""
+        return abs(self.screen.z)
+
+    @cached_property
+    def _linear(self) -> tuple[np.ndarray, np.ndarray]:
+        """As of a `BeamProjection`."""
+        along = np.array(self.screen.axes[:2]).T
+        ahead = np.array(self.screen.axes[2]) * self.distance * self.forward
+        return (ahead + along @ shape_of(self.screen).centre)[:2], along[:2]
+
+    def directions_to(self, u: np.ndarray, v: np.ndarray) -> Callable[..., tuple]:
+        """As of a `ScreenProjection`."""
+        ahead = tuple(c.reshape(np.shape(u)) for c in self._ahead(u, v))
+        return lambda x, y, z: ahead
+
+    def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As of a `ScreenProjection`; linear, also of a screen that is tilted."""
+        middle, by = self._linear
+        return middle[0] + by[0, 0] * x + by[0, 1] * y, middle[1] + by[1, 0] * x + by[1, 1] * y
+
+
+def projection_of(scene: Scene, mean: float) -> ScreenProjection | None:
+    """Projection of a scene's screen for a surface of this mean height, mm; None for an upright plane screen."""
+    screen, side = scene.screen, scene.lens.interaction.side
+    if screen.far:
+        return FarProjection(screen, mean, side, scene.source.axis)
+    if scene.source.oblique:
+        return BeamProjection(screen, mean, side, scene.source.axis)
+    return None if screen.upright else ScreenProjection(screen, mean, side)
+
+
 def stretching_surface(scene: Scene, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Heights (n, m), mm, at x (n,), y (m,) of the quadratic surface that in tilted light stretches the lens onto the screen, to
     first order: the optimal map between normal distributions of their second moments (Olkin & Pukelsheim, Linear Algebra Appl. 48,

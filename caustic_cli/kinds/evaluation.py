@@ -111,13 +111,9 @@ class LensEvaluation:
 
     def add_beam(self) -> None:
         """Add the figures of a shaped beam, where the loss is that of one."""
-        if (how := self.problem.stages[-1].rendering.bright) is None or self.target.ndim > 2:
-            return
-        bright, scene, seen = how.on(self.problem.target), self.problem.scene, self.light or self.exposure
-        self.figures["beam"] = beams.beam_figures(seen.image, float(seen.leaving), bright, scene.screen.pixel)
-        if self.light is not None and scene.screen.upright:
-            heights = self.state.heights
-            self.figures["beam"]["vortices"] = beams.vortices(scene, self.field, heights, bright.mask.numpy())
+        problem, seen = self.problem, self.light or self.exposure
+        how = problem.scene, self.field, self.state.heights, problem.target.numpy(), problem.stages[-1].rendering.bright
+        self.figures |= beams.shaped_figures(*how, seen)
 
     @property
     def few(self) -> tuple[float, ...]:

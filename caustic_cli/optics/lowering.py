@@ -92,4 +92,4 @@ def covers(screen: Screen | PlacedScreen, fused: Fused | None) -> TypeGuard[Scre
     """Whether a fused kernel splats onto such a screen."""
     if not isinstance(screen, Screen) or fused is None:
         return False
-    return screen.upright or (getattr(fused, "tilts", False) and not screen.curved and not screen.windows)
+    return screen.upright or (getattr(fused, "tilts", False) and not (screen.curved or screen.windows or screen.far))

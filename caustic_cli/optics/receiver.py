@@ -36,11 +36,13 @@ def dot(a: Vector, b: Vector) -> float:
 
 @dataclass(frozen=True)
 class NormalPlane:
-    """A plane normal to the light: its frame (e1, e2, e3) and Z, mm, see the module; and the windows in front of it."""
+    """A plane normal to the light: its frame (e1, e2, e3) and Z, mm, see the module; and the windows in front of it.  For the far
+    field Z is the focal length F, and X, Y are F q, see `scene.screen`."""
 
     axes: Axes
     z: float
     windows: tuple[Window, ...] = ()
+    far: bool = False
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,9 @@ class Receiver:
         """The plane through its centre normal to the axis, with e1 along the screen's x before a rotation about its normal; its own
         plane and axes if it is `across`."""
         (u, v, n), axis = self.axes, self.axis
+        if self.screen.far:
+            n = n if self.forward > 0 else (-n[0], -n[1], -n[2])
+            return NormalPlane((u, v, n), abs(self.screen.z), self.screen.windows, far=True)
         if self.across:
             return NormalPlane(self.axes, dot(self.middle, n), self.screen.windows)
         turn = math.radians(sum(self.screen.tilt[2:]))
@@ -141,8 +146,8 @@ class Receiver:
 
     @property
     def across(self) -> bool:
-        """Whether it is perpendicular to the axis, and not rotated about that."""
-        return abs(dot(self.axes[2], self.axis)) >= ACROSS and not any(self.screen.tilt[2:])
+        """Whether it is perpendicular to the axis, and not rotated about that, or the far field."""
+        return self.screen.far or (abs(dot(self.axes[2], self.axis)) >= ACROSS and not any(self.screen.tilt[2:]))
 
     def corners(self) -> list[Vector]:
         """Its four corners in space, mm."""

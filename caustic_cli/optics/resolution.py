@@ -42,6 +42,8 @@ class Resolution:
     lens: float
     wavelength: float = GREEN
     said: bool = False
+    #: Of widths on the screen.
+    unit: str = "mm"
 
     @classmethod
     def of(cls, scene: Scene, picture: float, magnification: float) -> Resolution:
@@ -57,6 +59,7 @@ class Resolution:
             lens.size[0],
             wavelength,
             bool(scene.light.wavelengths),
+            screen.unit,
         )
 
     @classmethod
@@ -110,8 +113,9 @@ class Resolution:
         """The resolution limit as a sentence."""
         n = self.resolvable
         text = (
-            f"about {n} x {n} details are resolved (diffraction {self.diffraction:.2g} mm, source {self.source:.2g} mm"
-            f"{f' or {self.source / self.pixel:.2g} pixels' if self.source else ''}, pixel {self.pixel:.2g} mm)"
+            f"about {n} x {n} details are resolved (diffraction {self.diffraction:.2g} {self.unit}, source"
+            f" {self.source:.2g} {self.unit}{f' or {self.source / self.pixel:.2g} pixels' if self.source else ''}, pixel"
+            f" {self.pixel:.2g} {self.unit})"
         )
         larger = self.lens_for_all()
         return text + (f"; a lens of {larger:{'.0f' if larger >= 100 else '.2g'}} mm would resolve {self.wanted}" if larger else "")
@@ -161,7 +165,7 @@ def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial | No
     line = (torch.arange(POINTS, dtype=torch.float64, device=heights.device) + 0.5) * (2.0 / POINTS) - 1.0
     x, y = (c.reshape(-1) * r for c, r in zip(torch.meshgrid(line, line, indexing="ij"), field.half_size, strict=True))
     gx, gy, xx, xy, yy = field.at(heights.detach(), x, y, (*FIRST[1:], *SECOND))
-    return Paraxial(x, y, gx, gy, xx, xy, yy, distance, 1.0 + distance * vergence)
+    return Paraxial(x, y, gx, gy, xx, xy, yy, distance, float(not scene.screen.far) + distance * vergence)
 
 
 def local_magnification(scene: Scene, field: HeightField, heights: Tensor) -> float | None:

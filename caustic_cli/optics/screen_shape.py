@@ -75,6 +75,21 @@ class CurvedScreen(PlaneScreen):
         return [c.numpy().reshape(np.broadcast_shapes(np.shape(x), np.shape(y))) for c in self.surface.at(self.heights, u, v)]
 
 
+@dataclass(frozen=True, eq=False)
+class FarField(PlaneScreen):
+    """The far field, in the screen's frame: its focal length, and its centre's coordinates along its axes, mm."""
+
+    focal: float
+    centre: tuple[float, float]
+
+    def land(self, backend, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
+        """By direction alone."""
+        like = next(c for c in (*direction, *origin) if isinstance(c, Tensor))
+        x, y, along = (torch.as_tensor(_dot(direction, axis), dtype=like.dtype, device=like.device) for axis in axes)
+        x, y = (self.focal * c.expand(like.shape) - at for c, at in zip((x, y), self.centre, strict=True))
+        return x, y, (forward * along).expand(like.shape) > 0
+
+
 def _double(value):
     return value.double() if isinstance(value, Tensor) else value
 
@@ -100,6 +115,9 @@ def _shape(radius: tuple[float, float], sags: Sags | None) -> PlaneScreen:
 
 def shape_of(screen: Screen) -> PlaneScreen:
     """The shape of a screen."""
+    if screen.far:
+        x, y = (_dot(screen.centre, axis) for axis in screen.axes[:2])
+        return FarField(abs(screen.z), (x, y))
     return _shape(tuple(screen.radius), screen.sags)
 
 

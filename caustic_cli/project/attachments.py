@@ -21,6 +21,7 @@ from caustic_cli.io.files import read_bytes
 from caustic_cli.io.picture import read_picture
 from caustic_cli.loading import OnDemand
 from caustic_cli.scene.gradient import MOST_VALUES, checked_volume
+from caustic_cli.scene.screen import MAX_SAGS
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.section import Attached
 from caustic_cli.schema.table import TABLE, Section, Setting
@@ -164,6 +165,16 @@ def _sags(path: Path, _given: Given) -> _Read:
     return _Read(data, heights, path.suffix.lower())
 
 
+def _phase(path: Path, _given: Given) -> _Read:
+    """A phase over the aperture."""
+    accepted = f"a 2-D .npy of the phase in rad over the aperture, of at most {MAX_SAGS} values along each axis, is needed"
+    with open_npy(path, accepted) as stored:
+        if len(stored.shape) != 2 or max(stored.shape) > MAX_SAGS:
+            raise InputError(f"holds {' x '.join(map(str, stored.shape))} values; {accepted}")
+        values = stored.read_reals()
+    return _Read(read_bytes(path, sags.MOST_BYTES, accepted), values, ".npy")
+
+
 def _errors(path: Path, _given: Given) -> _Read:
     data = read_bytes(path, settings.MAX_BYTES, settings.ACCEPTED)
     return _Read(data, tolerances.read(path), ".toml")
@@ -173,6 +184,7 @@ def _errors(path: Path, _given: Given) -> _Read:
 READERS: dict[str, Callable[[Path, Given], _Read]] = {
     "source.profile": _profile,
     "source.file": _light,
+    "source.phase_file": _phase,
     "source.intensity": _intensity,
     "lamp.intensity": _intensity,
     "lamp.file": _rays,

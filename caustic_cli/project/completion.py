@@ -34,9 +34,11 @@ from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.scene import Offset, Source, sources
 from caustic_cli.scene.interaction import Interior, interaction_of
 from caustic_cli.scene.light import RGB
+from caustic_cli.scene.screen import FOCAL
 from caustic_cli.schema.table import LensSettings, Parameters, ScreenSettings, SourceSettings, TargetSettings, check
 
 DEFAULT_RESOLUTION = 250
+FAR = "far"  # the place of a screen in the far field
 STEEPEST = 1.25  # least radius of a derived sphere in half diagonals of the lens: slopes up to 1.3
 OBLONG = 2.5  # anamorphic ratio of the magnifications from which on another lens shape is recommended
 COLOR_GLASS = "N-BK7"  # for a coloured picture without glass or index, since dispersion has to be known
@@ -103,7 +105,11 @@ def _in_colour(s: Settings) -> Settings:
 def _placed(s: Settings, by: Parameters, aspect: float, placed: bool, over: Ranges | None) -> ScreenSettings:
     """The screen at its distance, with the size and the pixels that are given; placed: whether its distance is given as such."""
     screen, side = s.screen, interaction_of(s.lens.mirror).side
-    if by.throw is not None:
+    if math.isinf(by.throw or 0.0) or by.screen_place == FAR or (screen.far and by.throw is None and not placed):
+        screen = screen.changed(z=side * FOCAL, far=True)
+    elif by.throw is not None:
+        if screen.far:
+            raise InputError(f"a size in mrad or degrees is one in the far field, ⟨+throw⟩ inf, got {by.throw:g} mm")
         screen = screen.changed(z=side * by.throw)
     elif not placed:
         screen = screen.changed(z=side * screen.z)
@@ -182,6 +188,8 @@ def complete_lens(s: Settings, source: Source) -> LensSettings:
         # The pictures of lenslets are superimposed: the light through their centres converges like that of a focusing lens.
         way = -1.0 if lens.crossing else 1.0
         across, along = (way * t / w if k == 1 else 0.0 for t, w, k in zip(s.target.size, lens.size, array, strict=True))
+        if s.screen.far:  # without deflection all light lands at its centre, not straight ahead
+            across, along = across + 1.0, along + 1.0
         vergence = 0.0
         if source.nearest < lens.z_in:  # vergence at the surface, 1/mm; 0 for a source at infinity
             inside = interaction.interior(Interior(index)).index

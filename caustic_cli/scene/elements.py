@@ -270,6 +270,7 @@ BESIDE_ELEMENTS = Capability(
     {
         **dict.fromkeys(("mirror", "gradient index", "lenslet array"), "⟨{setting}⟩" + NOT_BESIDE),
         "two sides": "⟨{scene.second_setting}⟩" + NOT_BESIDE,
+        "far field": "⟨+throw⟩ inf, a picture in the far field," + NOT_BESIDE,
     },
 )
 BESIDE_LENSES = Capability("other lenses and curved mirrors", {"ray file": "⟨source.type⟩ rays" + NOT_BESIDE})

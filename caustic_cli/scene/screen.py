@@ -3,6 +3,10 @@
 A curved screen is a height field S(x, y) over its tangent plane.  Its pixels are equal cells of x and y in that plane, so the
 picture appears undistorted in orthographic projection along the screen's normal.  S > 0 lies on the side of the normal, which is +z
 for an upright screen.
+
+A far screen is the far field, as in the back focal plane of an ideal lens of focal length F = |z| that stands against the surface:
+light with the direction cosines q along the screen's axes lands at F q, from wherever it comes.  With F = FOCAL, 1 m, the screen's
+lengths are mrad.
 """
 
 from __future__ import annotations
@@ -26,6 +30,10 @@ MAX_SAGS = 4096
 STEEPEST = 0.98
 #: Least angle between the plane of a screen and the light, degrees: a beam is there a hundred times as long as it is wide.
 GRAZING = 0.5
+#: Focal length with which lengths on a far screen are mrad, mm.
+FOCAL = 1000.0
+#: Largest direction cosine of a corner of a far screen.
+WIDEST = 0.5
 #: Radii of a plane screen.
 PLANE = (math.inf, math.inf)
 #: Sine of the angle between a direction and the y axis up to which they count as parallel.
@@ -113,9 +121,19 @@ class Screen:
     mirrored: tuple[bool, bool] = (False, False)
     #: What light has to pass on its way to it.
     windows: tuple[Window, ...] = ()
+    #: Whether it is the far field, see the module.
+    far: bool = False
 
     def __post_init__(self):
         check_all("screen", self, "size", "z", "resolution", "tilt", "shift")
+        if self.far and self.curved:
+            raise InputError("⟨screen.far⟩ is the far field, which has no radius and no shape: leave out ⟨screen.radius⟩")
+        if self.far and self.z and (widest := math.hypot(*self.half_size) / abs(self.z)) > WIDEST:
+            raise InputError(
+                f"⟨screen.far⟩: the screen reaches {math.degrees(math.asin(min(1.0, widest))):.3g} degrees from its centre at its"
+                f" corners, and {math.degrees(math.asin(WIDEST)):.3g} at most are supported: a screen smaller than"
+                f" {' x '.join(f'{WIDEST / widest * c:.4g}' for c in self.size)} {self.unit}"
+            )
         if len(self.tilt) not in (2, 3):
             raise InputError(f"⟨screen.tilt⟩ must be two or three angles, got {len(self.tilt)}")
         if any(isinstance(r, bool) or not isinstance(r, int | float) or math.isnan(r) or r == 0 for r in self.radius):
@@ -140,8 +158,13 @@ class Screen:
 
     @property
     def upright(self) -> bool:
-        """Whether it is plane, perpendicular to the axis and not seen in mirrors."""
-        return not (self.curved or any(self.tilt) or self.windows)
+        """Whether it is plane, perpendicular to the axis, at a finite distance and not seen in mirrors."""
+        return not (self.curved or any(self.tilt) or self.windows or self.far)
+
+    @property
+    def unit(self) -> str:
+        """Of lengths on it."""
+        return "mrad" if self.far and abs(self.z) == FOCAL else "mm"
 
     @property
     def uncurved(self) -> Screen:

@@ -63,6 +63,7 @@ TRAITS: Mapping[str, Trait] = {
     "tilted screen": Trait("a tilted screen", lambda s: any(s.screen.tilt), ("screen.tilt",)),
     "shifted screen": Trait("a shifted screen", lambda s: any(s.screen.shift), ("screen.shift",)),
     "curved screen": Trait("a curved screen", lambda s: s.screen.curved, ("screen.radius", "screen.shape_file")),
+    "far field": Trait("a picture in the far field", lambda s: s.screen.far, ("screen.far",)),
     "several sources": Trait("several sources", lambda s: len(s.source.members) > 1, ("source.also",)),
     "sources at once": Trait(
         "several sources at once", lambda s: len(s.source.members) > 1 and not s.source.in_turn, ("source.also",)
@@ -137,4 +138,5 @@ BEYOND_CLEAR = (
     "tilted screen",
     "shifted screen",
     "curved screen",
+    "far field",
 )

@@ -213,7 +213,8 @@ class SourceSettings(Section):
         return self.get("also", ())
 
     type: str = setting("plane: collimated light along +z over the aperture; point; grid of points; disc, an extended source; rays,"
-            " a ray file; gaussian, the beam of a laser", default="plane", why="the thesis' first source, section 4.2.1",
+            " a ray file; gaussian, the beam of a laser; measured, a beam by its phase", default="plane", why="the thesis' first"
+            " source, section 4.2.1",
             option=Option("--source", commands=BOTH))
     power: float = setting("total power of the source, through the aperture or into the cone; in lm, images are in lux", "W", 0.0,
             checks.POWER, above=True, default=1.0, why="images are fractions of the source's power",
@@ -221,9 +222,12 @@ class SourceSettings(Section):
     power_unit: str = setting("W, or lm for images in lux", choices=("W", "lm"), default="W", written=False)
     profile: str | None = setting("plane: file in this directory with the relative irradiance over the aperture", file="profile")
     file: str | None = setting("ray file (IES TM-25 .tm25ray, Zemax .dat or .sdf, LightTools .ray or .txt), of which the project"
-            " keeps a copy; for a disc, a picture of its brightness, for a plane wave one of its irradiance over the aperture, such"
-            " as that of a measured beam, both with linear values",
+            " keeps a copy; for a disc, a picture of its brightness, for a plane wave or a measured beam one of the irradiance over"
+            " the aperture, all with linear values",
             option=Option("--source-file", "FILE", BOTH), file="source")
+    phase_file: str | None = setting("measured: file of the phase over the aperture, in rad at the wavelength, not wrapped, which"
+            " increases along the light; a 2-D .npy [i, j], of which the project keeps a copy",
+            option=Option("--source-phase", "FILE", BOTH), file="phase")
     position: Points | None = setting("point: one or several [x, y, z]; grid, disc: the centre; rays: the file's origin", "mm",
             *DISTANCE, derived="on the axis, five lens widths in front of the lens",
             option=Option("--source-position", "X,Y,Z", BOTH))
@@ -409,6 +413,8 @@ class ScreenSettings(Section):
     radius: Pair | None = setting("radii of curvature of a curved screen along x and y: the same for a sphere, inf along one axis"
             " for a cylinder; positive bends the edges towards +z, away from a lens", "mm", derived="plane", written=False,
             option=Option("--screen-radius", "R[,RY]", BOTH))
+    far: bool = setting("the picture in the far field, as in the focus of an ideal lens of focal length z; at 1000 mm all lengths"
+            " on the screen are mrad", default=False, written=False)
     shape_file: str | None = setting("file of a screen's shape, of which the project keeps a copy: heights in mm along +z on a"
             " uniform grid over the screen, borders included; a 2-D .npy [i, j] or a .tif of 32-bit floats",
             option=Option("--screen-shape", "FILE", BOTH), file="screen")
@@ -586,26 +592,28 @@ class Parameters(Section):
     def __init__(self, *given: Mapping[str, Any], **values: Any):
         super().__init__(*given, **values)
         for key in {"mag", "margin", "throw", "quality", "rays"} & {*self}:
-            check(key, self[key])
+            if (key, self[key]) != ("throw", math.inf):
+                check(key, self[key])
 
-    throw: float | None = setting("distance from the lens' origin to the screen, in front of a mirror", "mm", -1e12, 1e12,
-            derived="300", option=Option("--throw", "MM"), speaks_for=("screen.z",), before="screen.z")
+    throw: float | None = setting("distance from the lens' origin to the screen, in front of a mirror; inf for the far field, in"
+            " which sizes on the screen are in mrad", "mm", -1e12, 1e12, derived="300", option=Option("--throw", "MM"),
+            speaks_for=("screen.z", "screen.far"), before="screen.z")
     screen_place: str | None = setting("part of a room as the screen, where the light meets it: floor:1m, ceiling:1m or wall:2m,"
             " which may have ,AZIMUTH of the picture's top or of the wall; or any plane, point=X,Y,Z;normal=X,Y,Z;up=X,Y,Z, the"
-            " normal towards the viewer, with room; before it for east, north and up; far, the far field of a lamp, with"
+            " normal towards the viewer, with room; before it for east, north and up; far, the far field, of a lamp with"
             " lamp.angles", derived="square to the light", option=Option("--screen", "PLACE"),
             speaks_for=("screen.z", "screen.tilt", "screen.shift"), before="screen.z")
-    screen_size: Pair | None = setting("full width and height of the screen; a single length keeps the picture's aspect ratio",
-            "mm", derived="picture plus margin", option=Option("--screen-size", "W[xH]"), speaks_for=("screen.size",),
-            before="screen.size")
+    screen_size: Pair | None = setting("full width and height of the screen; a single length keeps the picture's aspect ratio; in"
+            " mrad or deg of one in the far field", "mm", derived="picture plus margin", option=Option("--screen-size", "W[xH]"),
+            speaks_for=("screen.size",), before="screen.size")
     resolution: Wholes | None = setting("pixels of the whole screen; a single number is across, the rows follow from the aspect"
             " ratio", derived="250", why="table D.2 of the thesis", option=Option("--resolution", "N[xM]"),
             speaks_for=("screen.resolution",), before="screen.resolution")
     mag: float = setting("width of the picture in lens widths", low=1e-3, high=1e3, default=3.0, why="table 6.1 of the thesis",
             option=Option("--mag"), before="target.file")
     picture_size: Pair | None = setting("full width and height of the picture on the screen instead of a magnification; a single"
-            " length keeps its aspect ratio", "mm", derived="by the magnification", option=Option("--picture-size", "W[xH]"),
-            speaks_for=("target.size",), before="target.file")
+            " length keeps its aspect ratio; in mrad or deg of one in the far field", "mm", derived="by the magnification",
+            option=Option("--picture-size", "W[xH]"), speaks_for=("target.size",), before="target.file")
     margin: float = setting("total width of the dark border relative to the picture", low=0.0, high=100.0, default=0.28,
             why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, which shows stray light", option=Option("--margin"),
             before="target.file")

@@ -4,7 +4,7 @@ error               e, the relative error in the mask
 in_mask, in_region  fractions of the light behind the lens
 peak_to_valley      (max - min) / (max + min) of I / T in the mask
 rms                 standard deviation of I / T in the mask over its mean
-edge_width          mm: area where the irradiance is between 1 / e^2 and 1 - 1 / e^2 of its mean in the brighter half of the
+edge_width          mm or mrad: area where the irradiance is between 1 / e^2 and 1 - 1 / e^2 of its mean in the brighter half of the
                     picture's mask, over the length of the picture's contour at half its peak
 vortices            zeros of the field within the mask, about which its phase turns once
 """
@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.region import Bright
+from caustic_cli.optics.image import Image
+from caustic_cli.optics.region import Bright, Region
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
-from caustic_cli.optics.waves.image import Imager, lines_of
+from caustic_cli.optics.waves.image import Imager, WaveImage, lines_of
 from caustic_cli.optics.waves.propagation import PrunedExposure
 from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.scene import Scene
@@ -39,6 +40,20 @@ def beam_figures(image: Tensor, leaving: float, bright: Bright, pixel: tuple[flo
         "rms": float(ratio.std(correction=0) / ratio.mean()),
         "edge_width": edge_width(image.cpu().numpy(), bright.target.cpu().numpy(), pixel),
     }
+
+
+def shaped_figures(
+    scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray, region: Region | None, light: WaveImage | Image | None
+) -> dict[str, dict[str, float]]:
+    """The figure beam of a lens with heights (n, m) mm, of its image of a target (n_x, n_y), where a region is given; with vortices
+    if it is a wave image, on an upright screen."""
+    if region is None or light is None or target.ndim > 2:
+        return {}
+    bright = region.on(torch.from_numpy(target))
+    found = beam_figures(light.image, float(light.leaving), bright, scene.screen.pixel)
+    if isinstance(light, WaveImage) and (scene.screen.upright or scene.screen.far):
+        found["vortices"] = vortices(scene, field, heights, bright.mask.numpy())
+    return {"beam": found}
 
 
 def edge_width(image: np.ndarray, target: np.ndarray, pixel: tuple[float, float]) -> float:

@@ -121,8 +121,8 @@ def write_report(
     axes = figure.subplots(2, 4, gridspec_kw=PLACES)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
     judged = image if waves is None else waves
-    _draw_images(axes[0], target, _judged(judged, waves is not None, figures, colours), figures, extent, encoding)
-    _draw_error(axes[0, 2], target, judged, extent)
+    _draw_images(axes[0], target, _judged(judged, waves is not None, figures, colours), figures, extent, screen.unit, encoding)
+    _draw_error(axes[0, 2], target, judged, extent, screen.unit)
     _draw_section(axes[0, 3], target, judged, screen)
     rx, ry = lens.half_size
     volume = None if lens.gradient is None else lens.gradient.volume
@@ -131,7 +131,7 @@ def write_report(
         if volume is None
         else (volume.mean(-1), "index", "index, mean along z")
     )
-    drawn = _draw_image(axes[1, 0], relief, [-rx, rx, -ry, ry], name, "x on the lens (mm)", cmap="viridis")
+    drawn = _draw_image(axes[1, 0], relief, [-rx, rx, -ry, ry], name, "mm", "lens", cmap="viridis")
     _bar(drawn, axes[1, 0], unit)
     place = axes[1, 1].get_subplotspec()
     axes[1, 1].remove()
@@ -164,6 +164,7 @@ def _draw_images(
     shown: Shown,
     figures: dict,
     extent: Sequence[float],
+    length: str,
     encoding: str,
 ) -> None:
     """The target and the image that judges the lens at the same exposure."""
@@ -176,27 +177,28 @@ def _draw_images(
             if encoding == "srgb"
             else Normalize(0.0, top, clip=True)
         )
-        drawn = _draw_image(axis, picture, extent, title, cmap="gray", norm=norm)
+        drawn = _draw_image(axis, picture, extent, title, length, cmap="gray", norm=norm)
         if colours is not None:
             axis.imshow(codes_of(colours(top), 1.0, encoding), extent=tuple(extent))
         if prefix is not None:
             _bar(drawn, axis, _irradiance_words(figures, prefix))
 
 
-def _draw_error(axis: Axes, target: np.ndarray, image: np.ndarray, extent: Sequence[float]) -> None:
+def _draw_error(axis: Axes, target: np.ndarray, image: np.ndarray, extent: Sequence[float], length: str) -> None:
     """The difference of image and target, each over its own mean."""
     error = (image / max(image.sum(), 1e-300) - target / target.sum()) * target.size
     most = _scale_of(error, (image > 0) | (target > 0))
-    drawn = _draw_image(axis, error, extent, "error: too dark (blue), too bright (red)", cmap="coolwarm", vmin=-most, vmax=most)
+    title = "error: too dark (blue), too bright (red)"
+    drawn = _draw_image(axis, error, extent, title, length, cmap="coolwarm", vmin=-most, vmax=most)
     _bar(drawn, axis, "of the mean irradiance", extend="both")
 
 
 def _draw_image(
-    axis: Axes, picture: np.ndarray, extent: Sequence[float], title: str, xlabel: str = "x on the screen (mm)", **style
+    axis: Axes, picture: np.ndarray, extent: Sequence[float], title: str, length: str, place: str = "screen", **style
 ) -> AxesImage:
-    """An image with its axes in mm, with as many ticks as fit."""
+    """An image with its axes in a unit of length, or mrad, with as many ticks as fit."""
     drawn = axis.imshow(picture.T, origin="lower", extent=tuple(extent), **style)
-    axis.set(xlabel=xlabel, ylabel="y (mm)")
+    axis.set(xlabel=f"x on the {place} ({length})", ylabel=f"y ({length})")
     axis.set_title(title, pad=PAD)
     width, height = _size(axis)
     axis.xaxis.set_major_locator(_ticks(extent[0], extent[1], width, True))
@@ -262,8 +264,8 @@ def _draw_section(axis: Axes, target: np.ndarray, image: np.ndarray, screen: Scr
     y = ((row + 0.5) * (2.0 / target.shape[1]) - 1.0) * half[1]
     axis.step(x, image[:, row] / max(image.mean(), 1e-300), where="mid", color=COLOURS[1], lw=1.0, label="caustic")
     axis.step(x, target[:, row] / target.mean(), where="mid", color="black", lw=1.2, label="target")
-    axis.set(xlabel="x on the screen (mm)", ylabel="of the mean irradiance")
-    axis.set_title(f"along y = {y:.3g} mm", pad=PAD)
+    axis.set(xlabel=f"x on the screen ({screen.unit})", ylabel="of the mean irradiance")
+    axis.set_title(f"along y = {y:.3g} {screen.unit}", pad=PAD)
     axis.set_ylim(0.0, 1.25 * axis.get_ylim()[1])  # room for the legend above all data
     axis.legend(loc="upper right", ncols=2, frameon=False)
 

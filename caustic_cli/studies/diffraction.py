@@ -36,7 +36,10 @@ from caustic_cli.studies.retrace import sampler_for
 
 DIFFRACTION = Capability(
     "study of diffraction",
-    dict.fromkeys(("gradient index", "two sides"), "⟨study⟩ diffraction is of lenses of one index with a flat entrance"),
+    {
+        **dict.fromkeys(("gradient index", "two sides"), "⟨study⟩ diffraction is of lenses of one index with a flat entrance"),
+        "far field": "⟨study⟩ diffraction scales the throw with the lens, and this picture is in the far field",
+    },
 )
 #: Lens widths, mm; wavelengths, nm; full angles of a distant source, degrees.
 SIZES = (5.0, 10.0, 20.0, 40.0, 60.0, 100.0)

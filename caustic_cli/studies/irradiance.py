@@ -1,4 +1,5 @@
-"""Absolute irradiance on a screen, W/mm^2, or illuminance, lux = lm/m^2, where the source's power is luminous flux.
+"""Absolute irradiance on a screen, W/mm^2, or illuminance, lux = lm/m^2, where the source's power is luminous flux; in the far
+field radiant intensity, W/mrad^2, or luminous intensity, cd = lm/sr.
 
 Notation
     J       image, (n_x, n_y), parts of the source's power per pixel; (3, n_x, n_y) with colours
@@ -15,10 +16,20 @@ from torch import Tensor
 from caustic_cli.optics.screen_shape import areas
 from caustic_cli.scene import Scene, Screen
 
-#: Unit of power -> unit of E, and conversion factor from the unit of power per mm^2.
-UNITS = {"W": ("W/mm^2", 1.0), "lm": ("lux", 1e6)}
-#: Unit of power -> name of E.
-QUANTITIES = {"W": "irradiance", "lm": "illuminance"}
+#: Unit of power, unit of lengths on the screen -> unit of E, and conversion factor from the unit of power per square of the latter.
+UNITS = {
+    ("W", "mm"): ("W/mm^2", 1.0),
+    ("lm", "mm"): ("lux", 1e6),
+    ("W", "mrad"): ("W/mrad^2", 1.0),
+    ("lm", "mrad"): ("cd", 1e6),
+}
+#: Both -> name of E.
+QUANTITIES = {
+    ("W", "mm"): "irradiance",
+    ("lm", "mm"): "illuminance",
+    ("W", "mrad"): "radiant intensity",
+    ("lm", "mrad"): "luminous intensity",
+}
 
 
 def irradiance(image: np.ndarray, screen: Screen) -> np.ndarray:
@@ -30,7 +41,7 @@ def irradiance(image: np.ndarray, screen: Screen) -> np.ndarray:
 def per_part(scene: Scene) -> float:
     """E of a pixel of a plane screen that receives all the power of the source."""
     wide, tall = scene.screen.pixel
-    return scene.source.power * UNITS[scene.light.unit][1] / (wide * tall)
+    return scene.source.power * UNITS[scene.light.unit, scene.screen.unit][1] / (wide * tall)
 
 
 def irradiance_figures(scene: Scene, image) -> dict[str, float]:
@@ -44,10 +55,10 @@ def irradiance_figures(scene: Scene, image) -> dict[str, float]:
 
 
 def unit_figures(scene: Scene) -> dict[str, float | str]:
-    """Figures power, of the source, power_unit, and irradiance_unit; fractions_of, what that power is; and, of a source whose
-    spectrum is known, radiant_flux, W, luminous_flux, lm, and luminous_efficacy, lm/W."""
-    unit, power, each = scene.light.unit, scene.source.power, scene.light.efficacy
-    found = {"power": power, "power_unit": unit, "irradiance_unit": UNITS[unit][0]}
+    """Figures power, of the source, power_unit, screen_unit, of lengths on the screen, and irradiance_unit; fractions_of, what that
+    power is; and, of a source whose spectrum is known, radiant_flux, W, luminous_flux, lm, and luminous_efficacy, lm/W."""
+    unit, power, each, on_screen = scene.light.unit, scene.source.power, scene.light.efficacy, scene.screen.unit
+    found = {"power": power, "power_unit": unit, "screen_unit": on_screen, "irradiance_unit": UNITS[unit, on_screen][0]}
     found["fractions_of"] = scene.source.power_words(scene.pupil)
     if not each:
         return found
@@ -61,8 +72,8 @@ def in_units(figures: dict, prefix: str = "") -> list[tuple[str, str, float, flo
     own = next(key for key, (name, _) in UNITS.items() if name == figures["irradiance_unit"])
     found = [(QUANTITIES[own], UNITS[own][0], peak, mean)]
     if each := figures.get("luminous_efficacy"):
-        (other,) = UNITS.keys() - {own}
-        scale = UNITS[other][1] / UNITS[own][1] * (each if own == "W" else 1.0 / each)
+        other = "lm" if own[0] == "W" else "W", own[1]
+        scale = UNITS[other][1] / UNITS[own][1] * (each if own[0] == "W" else 1.0 / each)
         found.append((QUANTITIES[other], UNITS[other][0], scale * peak, scale * mean))
     return found
 

@@ -154,6 +154,7 @@ THROW = Capability(
         "near source": "the relief collects the light of the source, whatever the throw",
         "mirror": "its relief is not that of a sheet",
         "other elements": "they decide the throw, too",
+        "far field": "there is none",
     },
 )
 

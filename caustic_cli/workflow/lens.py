@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config import keywords
+from caustic_cli.config.design import region_of
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.export import format_of
@@ -30,6 +31,7 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.schema import checks
+from caustic_cli.studies.beam import shaped_figures
 from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import evaluation_rays, retrace
 from caustic_cli.studies.viewing import tristimulus_values
@@ -223,6 +225,9 @@ class Lens:
         )
         if light is None:
             return Render(np.empty((0, 0)), judged(figures, True))
+        if self.project is not None and self.target is not None and cut is None:
+            region = region_of(self.project.settings.design)
+            figures |= shaped_figures(plan.scene, self.field, self.heights, self.target, region, light)
         return Render(light.image.cpu().numpy(), judged(figures, True), tristimulus_values(plan.scene, light))
 
     def export(

@@ -76,6 +76,7 @@ FILE = (
 PAGE = Capability(
     "interactive page",
     {
+        "far field": "⟨html⟩: the page traces light to screens at a distance, and this picture is in the far field",
         "curved screen": "⟨html⟩: the page traces light to plane screens, not to curved ones",
         "gradient index": "⟨html⟩: the page traces lenses of one index, and this one's varies",
         "other elements": "⟨html⟩: the page traces a single lens, and this scene has [[element]] tables",

@@ -15,6 +15,10 @@ Intercepts differ by micrometres to tenths of a millimetre from the points where
 this short distance is the only approximation; it is good if the Fresnel scale of the distance is small compared with the surface
 structure.
 
+The far field is that in the focus of an ideal lens, of focal length L, in the reference plane: a ray through x with the slope q
+lands at X = L q.  Behind that lens its slope is q - x / L and its path, to the plane, less by n x^2 / 2 L, so that the same
+propagation, whose Fresnel kernel cancels the lens, is the Fourier transform of the field, which is exact.
+
 The field is needed on a uniform grid of intercepts.  Rays are aimed at the grid points by Newton's method on the pupil, with the
 mean magnification for the Jacobian (`ray_aiming`), and the remaining displacement e is corrected to first order: by Fermat's
 principle v(x) = v + n q . e up to O(e^2).  The derivative by the heights, with rays fixed on the pupil, is then the one at fixed x,
@@ -148,7 +152,16 @@ class Optics:
         state, (e1, e2, e3) = m.state.expanded(), self.plane.axes
         o, d = state.full((state.origin[0], state.origin[1], state.origin[2] + state.datum)), state.full(state.direction)
         qx, qy, qz = (sum(a * b for a, b in zip(d, e, strict=True)) for e in (e1, e2, e3))
-        t = (self.plane.z - sum(a * b for a, b in zip(o, e3, strict=True))) / qz
+        height = sum(a * b for a, b in zip(o, e3, strict=True))
+        if self.plane.far:
+            t = (vertex_of(self.system, self.parameters, self.plane) - height) / qz
+            ahead = (qz > 0) & torch.isfinite(t)
+            t, power = torch.where(ahead, t, torch.zeros_like(t)), torch.where(ahead, state.power, torch.zeros_like(state.power))
+            x, y = (sum(a * b for a, b in zip(o, e, strict=True)) + t * q for e, q in ((e1, qx), (e2, qy)))
+            n, f = self.index, self.distance
+            path = state.path + n * t - (0.5 * n / f) * (x * x + y * y)
+            return Intercepts(x, y, path, qx - x / f, qy - y / f, f * qx, f * qy, power)
+        t = (self.plane.z - height) / qz
         ahead = (t > 0) & torch.isfinite(t)
         ahead = ahead & passed_by(self.plane.windows, o, d)
         t = torch.where(ahead, t, torch.zeros_like(t))
@@ -160,13 +173,18 @@ class Optics:
 
 
 def distance_of(system: System, parameters: Parameters, plane: NormalPlane) -> float:
-    """L, the distance of a plane from the centre of the last surface, mm."""
+    """L, the distance of a plane from the centre of the last surface, mm; for the far field its focal length."""
+    return plane.z if plane.far else abs(plane.z - vertex_of(system, parameters, plane))
+
+
+def vertex_of(system: System, parameters: Parameters, plane: NormalPlane) -> float:
+    """Distance along a plane's normal of the centre of the last surface from the system's origin, mm."""
     last = system.elements[-1]
     x, y, z = last.pose.position
     if last.surface.shape is not None:
         middle, normal = float(parameters[last.name].detach().double().mean()), last.pose.axes[2]
         x, y, z = (c + middle * a for c, a in zip((x, y, z), normal, strict=True))
-    return abs(plane.z - dot((x, y, z), plane.axes[2]))
+    return dot((x, y, z), plane.axes[2])
 
 
 @dataclass(frozen=True)

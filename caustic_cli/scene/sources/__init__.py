@@ -71,6 +71,11 @@ CALLED = {
     "led": "an LED is ⟨source⟩ disc with ⟨+source.size⟩ 1x1, ⟨+source.position⟩ 0,0,-50 and ⟨+source.intensity⟩ lambertian",
     "lambertian": "that is an ⟨+source.intensity⟩, of ⟨source⟩ point, grid or disc",
     "laser": "a laser's beam is ⟨source⟩ gaussian with ⟨+source.waist⟩ and ⟨+source.wavelengths⟩, or plane where it is even",
+    **dict.fromkeys(
+        ("tophat", "top-hat", "flat-top", "flattop", "donut", "doughnut", "annular"),
+        "a beam of that shape is ⟨source⟩ plane with ⟨+source.file⟩, a picture of its irradiance over the aperture, or ⟨source⟩"
+        " measured with its phase, too",
+    ),
     "lamp": "a lamp is ⟨source⟩ disc with ⟨+source.size⟩ and ⟨+source.position⟩",
 }
 

@@ -35,12 +35,7 @@ class PlaneWave(Source):
         check("source.power", self.power)
         object.__setattr__(self, "axis", direction(self.tilt))
         if self.profile is not None:
-            e = np.asarray(self.profile, dtype=float)
-            with np.errstate(over="ignore"):
-                total = e.sum()
-            if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not 0 < total < np.inf:
-                raise InputError("⟨source.profile⟩ must be a 2-D picture, finite, not negative, and not black all over")
-            object.__setattr__(self, "profile", e)
+            object.__setattr__(self, "profile", picture_of(self.profile, "⟨source.profile⟩"))
 
     @property
     def collimated(self) -> bool:
@@ -55,6 +50,20 @@ class PlaneWave(Source):
     def extent_words(self, z_in: float) -> str:
         """As of a source."""
         return "a plane wave has one direction"
+
+
+def picture_of(values: np.ndarray, where: str) -> np.ndarray:
+    """A relative irradiance, (a, b) float64.
+
+    Raises:
+        InputError: it is none.
+    """
+    e = np.asarray(values, dtype=float)
+    with np.errstate(over="ignore"):
+        total = e.sum()
+    if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not 0 < total < np.inf:
+        raise InputError(f"{where} must be a 2-D picture, finite, not negative, and not black all over")
+    return e
 
 
 #: Largest angle of light to +z, degrees: beyond it glass of index 1.5 reflects more than a third, and the beam is a sixth as wide.
