@@ -55,6 +55,16 @@ class DesignOptions(options.Computation):
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Project directory.  [default: TARGET's stem + .caustic, here]"),
     ] = None
+    correct: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PHOTO",
+            help="Correct the lens of the project TARGET for the errors of the part in this photograph of its caustic: the heights"
+            " that give the picture with these errors added, into another project (-o); refused where the gain is not certain.",
+        ),
+    ] = None
+    marks: options.Marks = None
+    screen_corners: options.ScreenCorners = None
     plan: Annotated[
         bool,
         typer.Option(
@@ -86,6 +96,9 @@ def run(asked: DesignOptions) -> None:
     asked.quiet = asked.quiet or not speaks
     say, target = asked.say, asked.target
     _check(asked)
+    if asked.correct is not None:
+        _correct(asked)
+        return
     piped = not asked.resume and str(target) == "-"
     path = asked.out or Path(f"{'picture' if piped else target.stem or 'design'}.caustic")
     project, picture = target if target.is_dir() else path, target
@@ -125,6 +138,32 @@ def run(asked: DesignOptions) -> None:
         console.emit_json(lens.figures)
 
 
+def _correct(asked: DesignOptions) -> None:
+    """Correct the lens of a project by a photograph.
+
+    Raises:
+        InputError: other options are given.
+    """
+    if names := _beside_resume(asked) + [f"--{name}" for name in ("resume", "movie") if getattr(asked, name)]:
+        raise InputError(f"--correct takes the design of the project as it is: leave out {', '.join(names)}")
+    options.require_project(asked.target)
+    out = asked.out or Path(f"{asked.target.resolve().stem}-corrected.caustic")
+    device = asked.start_torch()
+
+    from caustic_cli.config.lamp import says_lamp  # noqa: PLC0415
+    from caustic_cli.workflow import correction  # noqa: PLC0415
+    from caustic_cli.workflow.outputs import photograph  # noqa: PLC0415
+
+    if says_lamp(asked.target):
+        raise InputError("--correct is for a lens before its light, not for a lamp around it")
+    where = (asked.marks, asked.screen_corners, out)
+    figures = correction.correct(asked.target, asked.correct, *where, force=asked.force, device=device, say=asked.say)
+    asked.say.table(f"photograph {asked.correct}", photograph.rows(figures["photo"]))
+    asked.say.table(figures["project"], correction.rows(figures))
+    if asked.json:
+        console.emit_json(figures)
+
+
 def _refuse_for_lamps(asked: DesignOptions) -> None:
     """Refuse what no lamp is designed with.
 
@@ -150,6 +189,8 @@ def _check(asked: DesignOptions) -> None:
         raise InputError(f"--{names[0]} is what {'--plan compares' if asked.plan else '--error chooses'}: leave it out")
     if asked.plan and asked.error is not None:
         raise InputError("--plan designs nothing, so --error has no meaning beside it: leave one out")
+    if asked.correct is None and (asked.marks or asked.screen_corners):
+        raise InputError(f"--{'marks' if asked.marks else 'screen-corners'} belongs to --correct, which names the photograph")
     if asked.resume and (names := _beside_resume(asked)):
         raise InputError(
             f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"

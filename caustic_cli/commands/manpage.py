@@ -184,6 +184,20 @@ relative RMS error of the resulting image; kkt_residual; power, as a fraction of
 For a render with \-\-rays\-plot: rays drawn, lost, lost_by (numbers of rays by the way in which they are lost: missed_surface,
 total_internal_reflection, away_from_screen, off_screen), image.
 .TP
+.B photo
+For a render with \-\-photo: file, registered_by, marks, mark_sigma_px; error of the picture in the frame of the screen,
+as_photographed (codes taken for sRGB), registered (moved, stretched and sheared onto the picture) and against_lens (onto the image
+of the lens), relative RMS; missing_light, a fraction; camera (gamma, background, gain, blur_mm, and displacements_mm that its marks
+leave, each with its standard deviation); part: deviation_rms_um and relief_scale with their standard deviations (_sigma),
+uncertainty_um (RMS of the standard deviation over the part), explained (fraction of the variance), not_told_apart; files.
+.TP
+.B correction
+For a design with \-\-correct: round; registered, predicted (registered errors of the part and of one of the corrected heights),
+error, predicted_error (the same in the frame of the screen) and gain, each with its standard deviation; moved_um; plot.
+.TP
+.B test_card
+For a render with \-\-test\-card: sheet, marks (files), size_mm.
+.TP
 .B rays, iterations, seconds, image, project
 Number of rays traced, number of iterations, wall time, paths of files.
 .TP

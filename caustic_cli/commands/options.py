@@ -38,6 +38,24 @@ At = Annotated[
     ),
 ]
 
+#: Where the screen is in a photograph.
+Marks = Annotated[
+    str | None,
+    typer.Option(
+        metavar="auto|FILE",
+        help="Where the screen is in the photograph: by the marks of the test card in it, or else by the picture itself (auto), or"
+        " by a CSV of marks: column, row (pixels from the centre of the upper left one), x, y (mm on the screen).  [default: auto]",
+    ),
+]
+ScreenCorners = Annotated[
+    tuple[str, str, str, str] | None,
+    typer.Option(
+        metavar="C,R C,R C,R C,R",
+        help="The same by the pixels of the screen's corners: column,row of its upper left, upper right, lower right and lower left"
+        " corner, as in render.png.",
+    ),
+]
+
 
 class Given:
     """Arguments and options of a command, as given.

@@ -158,6 +158,25 @@ class OutputOptions(options.Given):
             " 200,000 rays a time unless --rays says otherwise.",
         ),
     ] = None
+    photo: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PHOTO",
+            help="Also judge a photograph of the caustic of the part that was made: on the screen (photo.png, photo.npy), its"
+            " error, where light is missing (missing.png), and what is wrong with the part (part.png, part.npy,"
+            " deviation.npy: heights in mm over the aperture).",
+        ),
+    ] = None
+    marks: options.Marks = None
+    screen_corners: options.ScreenCorners = None
+    test_card: Annotated[
+        bool,
+        typer.Option(
+            "--test-card",
+            help="Also draw a sheet with marks around the picture's place, to be printed in true size and fixed on the screen for"
+            " --photo; writes card.png and card.csv beside the image.",
+        ),
+    ] = False
     want: Annotated[
         Path | None,
         typer.Option(
@@ -274,6 +293,8 @@ def _checked_size(asked: RenderOptions) -> list[int]:
     designed = [option for option in others if getattr(asked, option.replace("-", "_"))]
     if asked.cut and designed:
         raise InputError(f"--cut goes without --{designed[0]}, which looks at the surface as designed")
+    if asked.photo is None and (asked.marks or asked.screen_corners):
+        raise InputError(f"--{'marks' if asked.marks else 'screen-corners'} belongs to --photo, which names the photograph")
     if asked.verify not in (None, "mitsuba"):
         raise InputError(f"--verify must be mitsuba, got {asked.verify!r}")
     if asked.verify and asked.screen_at is not None:

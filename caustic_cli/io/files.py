@@ -28,7 +28,7 @@ MARK = SOFTWARE.encode()
 CREATED_BY = f"created by {SOFTWARE}"  # in a comment at the beginning of a text file
 #: Beginnings of the names of the files of a project that outputs must not replace.
 PARTS = ("project.toml", "checkpoints.h5", "target.", "profile.", "source.", "source-", "intensity.", "intensity-", ".outputs.json")
-PARTS += ("tolerances.toml", "second.", "screen.", "index.")
+PARTS += ("tolerances.toml", "second.", "screen.", "index.", "corrections.")
 NPY_MAGIC = b"\x93NUMPY"
 NPY_HEADER = 256  # bytes; NumPy itself pads to 64 or 128
 #: What an output needs.

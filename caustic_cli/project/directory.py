@@ -18,6 +18,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.io.files import LEFT_BEHIND, PARTS, destination, is_ours
 from caustic_cli.project import attachments, checkpoint, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.correction import CORRECTIONS
 from caustic_cli.project.project import CHECKPOINT, MADE, TOML, Project, is_project
 
 try:
@@ -80,7 +81,7 @@ def create(project: Project, force: bool, state: Checkpoint | None = None) -> No
                 for present in parts:
                     destination(present)  # refuses what is no regular file before anything is removed
                 for present in parts:
-                    if present.name in MADE or present.is_symlink():  # where a link leads is not the project's
+                    if present.name in (*MADE, CORRECTIONS) or present.is_symlink():  # where a link leads is not the project's
                         present.unlink()
                 _write(project, path, state)
             except BaseException:

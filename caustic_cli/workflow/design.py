@@ -41,6 +41,7 @@ from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.completion import complete, shape_words
+from caustic_cli.project.correction import refuse_corrected
 from caustic_cli.project.new import new_project
 from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, Project, is_project
@@ -261,6 +262,7 @@ def resume(
     with project.hold:
         if words := kind_of(project.settings).no_resume:
             raise project.error(words)
+        refuse_corrected(project.path)
         project.hold.enter_context(directory.locked(project.path))
         problem = problem_of(project, device)
         problem.refuse_obstructed()

@@ -14,9 +14,11 @@ from caustic_cli.workflow.outputs.hours import Hours
 from caustic_cli.workflow.outputs.illumination import Illumination
 from caustic_cli.workflow.outputs.image import RayPicture
 from caustic_cli.workflow.outputs.page import InteractivePage
+from caustic_cli.workflow.outputs.photograph import PartPhotograph
 from caustic_cli.workflow.outputs.rays_plot import RaysPlot
 from caustic_cli.workflow.outputs.report import ManufacturingReport
 from caustic_cli.workflow.outputs.second_target import SecondPicture
+from caustic_cli.workflow.outputs.test_card import TestCard
 from caustic_cli.workflow.outputs.tolerances import ToleranceAnalysis
 from caustic_cli.workflow.outputs.values import PixelValues
 from caustic_cli.workflow.outputs.verification import MitsubaComparison
@@ -37,6 +39,8 @@ OUTPUTS: tuple[type[Output], ...] = (
     Illumination,
     DayOfSunlight,
     RaysPlot,
+    TestCard,
+    PartPhotograph,
     MitsubaComparison,
 )
 

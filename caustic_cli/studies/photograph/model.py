@@ -1,0 +1,336 @@
+"""What a camera should record of a part: the image of its surface with a deviation, in codes of the photograph; derivatives.
+
+Notation
+    H           control heights of the exit as designed, (n, m) mm
+    d           deviation of the part, mm: a sum of cosine modes cos(k pi u) cos(l pi v) of unit RMS over a rectangle somewhat
+                larger than the aperture
+    s           scale of the relief, which is s times as high as it should be about its mean height
+    c           amplitudes (9,) of the displacements of `camera.displacements`, half widths of the screen
+    E           irradiance over its mean on the screen, on the pixels of a grid
+    L           light on the sensor, gain E + background, of which 1 saturates it
+    code        min(L, 1)^(1 / gamma), in [0, 1]
+
+Rays lie on a regular lattice and are traced by the tracer of the project.  To first order a ray's landing point depends on the
+surface through height and slope where it leaves: three traces, of a surface raised and tilted a little, give the derivatives with
+respect to every mode.  The image is a sum of quadratic B-splines (3 x 3 pixels) of the landing points, blurred by a Gaussian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+from scipy.sparse import csc_matrix
+from torch import Tensor
+
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.trace import tracers
+from caustic_cli.scene import Scene
+from caustic_cli.studies.photograph.camera import displacements
+
+#: Height and slope of the surfaces by which derivatives are found: displacements of rays of a thousandth of a pixel, well above
+#: rounding.
+RAISED, TILTED = 1e-4, 1e-6
+#: Width by which the rectangle of the modes is larger than the aperture at each of its edges, over the aperture: the slopes of
+#: cosines vanish at the edges of their rectangle, those of a part at its own do not.
+BEYOND = 0.15
+#: Pixels around the grid from which blur brings light.
+AROUND = 8
+#: Least light whose derivative is taken at face value: that of a root is infinite at 0.
+DIM = 2e-3
+#: Gaussians are cut at this many standard deviations.
+CUT = 3.5
+
+
+#: A part of the screen: its lower and upper X, and lower and upper Y.
+Window = tuple[tuple[float, float], tuple[float, float]]
+WHOLE: Window = ((-1.0, 1.0), (-1.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """How a sensor responds: `log_gain`, `background`, `log_gamma`, and `log_blur` of the standard deviation in half widths."""
+
+    log_gain: float = 0.0
+    background: float = 0.02
+    log_gamma: float = float(np.log(2.2))
+    log_blur: float = float(np.log(0.01))
+
+    @property
+    def values(self) -> np.ndarray:
+        """All four."""
+        return np.array([self.log_gain, self.background, self.log_gamma, self.log_blur])
+
+    def codes(self, E: np.ndarray) -> np.ndarray:
+        """Codes of blurred irradiance."""
+        return np.clip(np.exp(self.log_gain) * E + self.background, 0.0, 1.0) ** np.exp(-self.log_gamma)
+
+    def slopes(self, E: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivative of the codes by L and by log gamma."""
+        light = np.exp(self.log_gain) * E + self.background
+        power, inside = np.exp(-self.log_gamma), (light > 0) & (light < 1.0)
+        light = np.clip(light, DIM, 1.0)
+        code = light**power
+        return inside * power * code / light, -power * np.log(light) * code * inside
+
+    def irradiance(self, codes: np.ndarray) -> np.ndarray:
+        """E from codes."""
+        return (np.clip(codes, 0.0, 1.0) ** np.exp(self.log_gamma) - self.background) * np.exp(-self.log_gain)
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """Values of all unknowns: response, c, s - 1, and amplitudes (k, l) of the modes of d, mm."""
+
+    response: Response
+    camera: np.ndarray
+    scale: float
+    modes: np.ndarray
+
+    def with_modes(self, count: int) -> Guess:
+        """The same with `count` modes along each axis, further ones 0."""
+        k = min(count, len(self.modes))
+        modes = np.zeros((count, count))
+        modes[:k, :k] = self.modes[:k, :k]
+        return replace(self, modes=modes)
+
+
+def cosines(u: np.ndarray, count: int) -> np.ndarray:
+    """Cosine modes of unit RMS over their rectangle at u in [0, 1] of the aperture, (N, count)."""
+    k = np.arange(count)
+    return np.cos(np.pi * np.outer((u + BEYOND) / (1.0 + 2.0 * BEYOND), k)) * np.where(k > 0, np.sqrt(2.0), 1.0)
+
+
+def slopes_of_cosines(u: np.ndarray, count: int) -> np.ndarray:
+    """Derivatives of `cosines` by u."""
+    k = np.arange(count) / (1.0 + 2.0 * BEYOND)
+    return -np.sin(np.pi * np.outer(u + BEYOND, k)) * (np.pi * k * np.sqrt(2.0))
+
+
+def deviation(field: HeightField, modes: np.ndarray) -> Tensor:
+    """Control heights (n, m), mm, of the deviation with these amplitudes."""
+    x, y = (cosines(s.greville.numpy(), k) for s, k in zip(field.spaces, modes.shape, strict=True))
+    return field.interpolated(torch.from_numpy(x @ modes @ y.T))
+
+
+def scaled(heights: Tensor, scale: float) -> Tensor:
+    """Control heights of a relief that is 1 + scale times as high about its mean."""
+    middle = heights.mean()
+    return middle + (1.0 + scale) * (heights - middle)
+
+
+@dataclass(frozen=True, eq=False)
+class Landing:
+    """Rays on the screen: (X, Y) in half widths and power, (N,) each; those that do not arrive have none."""
+
+    x: np.ndarray
+    y: np.ndarray
+    power: np.ndarray
+
+
+class PartModel:
+    """The model of photographs of one part.
+
+    Args:
+        scene, field, heights: the lens as it was designed, with the error known of it so far.
+        rays: about how many.
+    """
+
+    def __init__(self, scene: Scene, field: HeightField, heights: Tensor, rays: int):
+        self.scene, self.field, self.heights = scene, field, heights.detach().double().cpu()
+        self._beyond = np.zeros((2, 1))
+        self._tracers = list(tracers(scene, field, rays_of(scene, "grid", rays), torch.float64, 1 << 24))
+
+    def made(self, guess: Guess) -> Tensor:
+        """Control heights of the part."""
+        return scaled(self.heights, guess.scale) + deviation(self.field, guess.modes)
+
+    def landing(self, guess: Guess) -> Landing:
+        """The rays of a part on the screen, by derivatives from the surface that was traced last (`trace`)."""
+        base = self.designed
+        moved = self._moved(guess) + self._beyond
+        return Landing(base.x + moved[0], base.y + moved[1], base.power)
+
+    def trace(self, guess: Guess) -> None:
+        """Trace the part itself, so that derivatives need only reach from here."""
+        exact, base, moved = self.land(self.made(guess)), self.designed, self._moved(guess)
+        self._beyond = np.nan_to_num(np.array([exact.x - base.x, exact.y - base.y]) - moved)
+
+    def _moved(self, guess: Guess) -> np.ndarray:
+        """Displacements on the screen by deviation and scale to first order, (2, N) half widths."""
+        (u, v), (rx, ry), k = self.places, self.field.half_size, len(guess.modes)
+        cu, su, cv, sv = cosines(u, k), slopes_of_cosines(u, k), cosines(v, k), slopes_of_cosines(v, k)
+        along = cv @ guess.modes.T  # (N, k)
+        local = [(cu * along).sum(1), (su * along).sum(1) / (2 * rx), (cu * (sv @ guess.modes.T)).sum(1) / (2 * ry)]
+        return np.einsum("sin,sn->in", self.responses, np.array(local)) + guess.scale * self.by_scale
+
+    def land(self, heights: Tensor) -> Landing:
+        """The rays of a surface on the screen."""
+        screen, found = self.scene.screen, []
+        with torch.no_grad():
+            for traced in self._tracers:
+                ray = traced.land({EXIT: heights}, screen)[0]
+                shape = torch.broadcast_shapes(*(torch.as_tensor(c).shape for c in (*ray.origin[:2], ray.power)))
+                found.append([torch.as_tensor(c).expand(shape).reshape(-1) for c in (*ray.origin[:2], ray.power)])
+                found[-1][2] = found[-1][2] * traced.weight
+        x, y, power = (torch.cat(c).numpy() for c in zip(*found, strict=True))
+        (rx, ry), (sx, sy) = screen.half_size, screen.shift
+        return Landing((x - sx) / rx, (y - sy) / ry, np.where(np.isfinite(x + y), power, 0.0))
+
+    @cached_property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the rays leave the designed surface, (u, v) in [0, 1], (N,) each."""
+        found, (rx, ry) = [], self.field.half_size
+        with torch.no_grad():
+            for traced in self._tracers:
+                state = traced.last({EXIT: self.heights}).state
+                shape = torch.broadcast_shapes(*(torch.as_tensor(c).shape for c in (*state.origin[:2], state.power)))
+                found.append([torch.as_tensor(c).expand(shape).reshape(-1) for c in state.origin[:2]])
+        x, y = (torch.cat(c).numpy() for c in zip(*found, strict=True))
+        return 0.5 * (x / rx + 1.0), 0.5 * (y / ry + 1.0)
+
+    @cached_property
+    def designed(self) -> Landing:
+        """The rays of the designed surface."""
+        return self.land(self.heights)
+
+    @cached_property
+    def responses(self) -> np.ndarray:
+        """Derivatives of the landing points (X, Y) by height and by both slopes, (3, 2, N), per mm and per unit."""
+        x, y = self.field.control_xy()
+        shapes = [(torch.full(self.field.shape, 1.0).double(), RAISED), (x[:, None].expand(self.field.shape), TILTED)]
+        shapes.append((y[None, :].expand(self.field.shape), TILTED))
+        up, along_x, along_y = (self._derivative(shape, step) for shape, step in shapes)
+        (u, v), (rx, ry) = self.places, self.field.half_size
+        return np.array([up, along_x - (2 * u - 1) * rx * up, along_y - (2 * v - 1) * ry * up])
+
+    @cached_property
+    def by_scale(self) -> np.ndarray:
+        """Derivatives of the landing points by the scale of the relief, (2, N)."""
+        return self._derivative(self.heights - self.heights.mean(), 1e-4)
+
+    def _derivative(self, shape: Tensor, step: float) -> np.ndarray:
+        """Derivative of the landing points by a multiple of a shape, control heights, (2, N)."""
+        more, less = (self.land(self.heights + sign * step * shape) for sign in (1.0, -1.0))
+        return np.nan_to_num(np.array([more.x - less.x, more.y - less.y]) / (2 * step))
+
+
+class Grid:
+    """The pixels on which a photograph is compared, n x m over a window of the screen; `smooth`: by how many both are blurred."""
+
+    def __init__(self, shape: tuple[int, int], smooth: float, window: Window = WHOLE):
+        self.shape, self.smooth, self.window = shape, smooth, window
+        self.wide = (shape[0] + 2 * AROUND, shape[1] + 2 * AROUND)
+
+    def inner(self, image: np.ndarray) -> np.ndarray:
+        """An image without what lies around the grid."""
+        return image[..., AROUND:-AROUND, AROUND:-AROUND]
+
+    def smoothed(self, image: np.ndarray, blur: float | None = None) -> np.ndarray:
+        """Images (..., n, m) blurred by this many pixels, `smooth` unless given."""
+        blur = self.smooth if blur is None else blur
+        return gaussian_filter(image, (0.0,) * (image.ndim - 2) + (blur, blur), truncate=CUT, mode="nearest") if blur > 0 else image
+
+    def sensor_blur(self, response: Response) -> float:
+        """The blur of the camera, pixels."""
+        (low, high), _ = self.window
+        return float(np.exp(response.log_blur)) * self.shape[0] / (high - low)
+
+    def splats(self, landing: Landing, camera: np.ndarray) -> tuple[csc_matrix, csc_matrix, csc_matrix]:
+        """Matrices (pixels of the wide grid, N) from powers to E, and from power times displacement along X and Y to its change."""
+        moved = np.einsum("k,kin->in", camera, displacements(landing.x, landing.y))
+        scale = [n / (high - low) for n, (low, high) in zip(self.shape, self.window, strict=True)]
+        seen = landing.x + moved[0], landing.y + moved[1]
+        at = [(c - low) * k - 0.5 + AROUND for c, k, (low, _) in zip(seen, scale, self.window, strict=True)]
+        middle, inside = [], np.isfinite(at[0] + at[1])
+        for c, n in zip(at, self.wide, strict=True):
+            c[~inside] = 1.0
+            nearest = np.floor(c + 0.5)
+            inside &= (nearest >= 1) & (nearest < n - 1)
+            middle.append(nearest)
+        weights, slopes, index = [], [], []
+        for c, nearest, n in zip(at, middle, self.wide, strict=True):
+            t = c - nearest
+            weights.append(np.array([0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2]) * inside)
+            slopes.append(np.array([t - 0.5, -2.0 * t, t + 0.5]) * inside)
+            index.append(np.clip(nearest, 1, n - 2).astype(np.int32) + np.array([-1, 0, 1], dtype=np.int32)[:, None])
+        rows = (index[0][:, None] * self.wide[1] + index[1][None]).reshape(9, -1).T.ravel()
+        pointers = np.arange(0, 9 * len(landing.x) + 1, 9, dtype=np.int32)
+        pixels = 4.0 * scale[0] * scale[1]  # of the whole screen
+
+        def matrix(along_x: np.ndarray, along_y: np.ndarray, factor: float) -> csc_matrix:
+            values = (along_x[:, None] * along_y[None]).reshape(9, -1).T.ravel() * (factor * pixels)
+            return csc_matrix((values, rows, pointers), shape=(self.wide[0] * self.wide[1], len(landing.x)))
+
+        by_x, by_y = matrix(slopes[0], weights[1], scale[0]), matrix(weights[0], slopes[1], scale[1])
+        return matrix(weights[0], weights[1], 1.0), by_x, by_y
+
+
+@dataclass(eq=False)
+class Prediction:
+    """The codes (n, m) predicted for a guess, with what their derivatives need."""
+
+    model: PartModel
+    grid: Grid
+    guess: Guess
+    landing: Landing
+    splats: tuple[csc_matrix, csc_matrix, csc_matrix]
+    #: E on the wide grid, sharp and blurred.
+    sharp: np.ndarray
+    blurred: np.ndarray
+
+    @classmethod
+    def of(cls, model: PartModel, grid: Grid, guess: Guess, landing: Landing | None = None) -> Prediction:
+        """The prediction; landing: of the same surface, if it is known already."""
+        landing = model.landing(guess) if landing is None else landing
+        splats = grid.splats(landing, guess.camera)
+        sharp = (splats[0] @ landing.power).reshape(grid.wide)
+        return cls(model, grid, guess, landing, splats, sharp, grid.smoothed(sharp, grid.sensor_blur(guess.response)))
+
+    @property
+    def codes(self) -> np.ndarray:
+        """On the grid, smoothed."""
+        return self.grid.inner(self.grid.smoothed(self.guess.response.codes(self.blurred)))
+
+    def by_response(self) -> np.ndarray:
+        """Derivatives of the codes by the four values of the response, (4, n, m)."""
+        r, grid = self.guess.response, self.grid
+        by_light, by_gamma = r.slopes(self.blurred)
+        step = 1e-2
+        wider = grid.smoothed(self.sharp, grid.sensor_blur(replace(r, log_blur=r.log_blur + step)))
+        gain = np.exp(r.log_gain)
+        stack = [by_light * gain * self.blurred, by_light, by_gamma, by_light * gain * (wider - self.blurred) / step]
+        return grid.inner(grid.smoothed(np.array(stack)))
+
+    def _of_images(self, images: np.ndarray) -> np.ndarray:
+        """Derivatives of the codes (N, n, m) from those of the sharp E, (pixels, N)."""
+        r, grid = self.guess.response, self.grid
+        images = grid.smoothed(np.ascontiguousarray(images.T).reshape(-1, *grid.wide), grid.sensor_blur(r))
+        images *= r.slopes(self.blurred)[0] * np.exp(r.log_gain)
+        return grid.inner(grid.smoothed(images))
+
+    def by_shape(self) -> Iterator[np.ndarray]:
+        """Derivatives of the codes by the amplitudes c, (9, n, m); by s, (1, n, m); by the modes (k, .), (l, n, m) for each k."""
+        power, (_, by_x, by_y) = self.landing.power, self.splats
+        fields = displacements(self.landing.x, self.landing.y) * power  # (9, 2, N)
+        yield self._of_images(by_x @ fields[:, 0].T + by_y @ fields[:, 1].T)
+        model, guess = self.model, self.guess
+        dx, dy = model.by_scale
+        yield self._of_images((by_x @ (power * dx) + by_y @ (power * dy))[:, None])
+        u, v = model.places
+        (up, along_x, along_y), (rx, ry), count = model.responses, model.field.half_size, len(guess.modes)
+        cu, cv = (cosines(c, count) for c in (u, v))
+        su, sv = slopes_of_cosines(u, count) / (2 * rx), slopes_of_cosines(v, count) / (2 * ry)
+        parts = [power * c for c in (*up, *along_x, *along_y)]  # up x, up y, slope x: x, y, slope y: x, y
+        for k in range(count):
+            a, b = cu[:, k], su[:, k]
+            of_value = [a * parts[0] + b * parts[2], a * parts[1] + b * parts[3]]
+            of_slope = [a * parts[4], a * parts[5]]
+            x, y = (of_value[i][:, None] * cv + of_slope[i][:, None] * sv for i in (0, 1))
+            yield self._of_images(by_x @ x + by_y @ y)

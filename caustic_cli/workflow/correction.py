@@ -1,0 +1,181 @@
+"""The corrected part: heights that give the picture with the errors of the part that was photographed.
+
+Notation
+    H, H'   control heights that were sent to be made, and that are to be sent next, mm
+    D       control heights of the design, which give the picture
+    e       deviation of the part known before, mm
+    s, d    error of the relief's scale and deviation inferred from the photograph: a part of H is made as (1 + s) (H + e) + d
+
+H' solves (1 + s) (H' + e) + d = D.  The errors of the picture are predicted for draws from the posterior of s and d, the same for
+both, so that what is refused is a gain that is not certain.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import CausticError, InputError
+from caustic_cli.io.files import naming
+from caustic_cli.kinds import problem_of
+from caustic_cli.project import correction, directory, uptodate
+from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.packing import rounded
+from caustic_cli.project.project import Project
+from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.studies.photograph import comparison, registration
+from caustic_cli.studies.photograph.model import Guess, deviation, scaled
+from caustic_cli.studies.retrace import retrace
+from caustic_cli.workflow import photographs
+from caustic_cli.workflow.design import provenance
+from caustic_cli.workflow.lens import Lens
+from caustic_cli.workflow.photographs import Judged
+from caustic_cli.workflow.reporter import Reporter
+
+#: Draws from the posterior, and rays per pixel and least of all for their images.
+DRAWS, EACH, LEAST = 8, 32, 200_000
+#: Least part of a photograph's variance that a fit must explain, and least gain over its standard deviation.
+EXPLAINED, CERTAIN = 0.97, 2.0
+PLOT = "correction.png"
+
+
+def correct(
+    path: Path,
+    photo: Path,
+    marks: str | None,
+    corners: tuple[str, ...] | None,
+    out: Path,
+    *,
+    force: bool = False,
+    device: str = "cpu",
+    say: Reporter,
+) -> dict[str, Any]:
+    """Correct the lens of a project for the errors of a part, by a photograph of its caustic; the figures of the JSON table.
+
+    Raises:
+        InputError: the photograph is not one of this lens' caustic, or `out` exists.
+        CausticError: the photograph is explained badly, the gain is within its uncertainty, or no surface is within the limits.
+    """
+    codes = registration.read_codes(photo)
+    project = Project.open(path)
+    lens = Lens.of(project)
+    if why := photographs.refuse_lens(lens):
+        raise InputError(why)
+    directory.check(out, force)
+    judged = photographs.judge(lens, photo, marks, corners, say, codes)
+    with naming(photo):
+        refuse_bad_fit(judged)
+    heights = corrected_heights(project, lens, judged, device)
+    figures = predicted(lens, judged, heights)
+    with naming(photo):
+        refuse_uncertain(figures)
+    before = judged.before
+    found = judged.found
+    known = lens.heights if before is None else lens.heights + before.deviation
+    made = scaled(known, found.guess.scale) + deviation(lens.field, found.guess.modes)
+    figures["round"] = 1 if before is None else len(before.history) + 1
+    history = (*(() if before is None else before.history), figures | {"photo": judged.figures})
+    state = replace(lens.state, heights=heights, start=None, unrounded=None, optimizer={}, parameters={}, reason="corrected")
+    target = replace(project, path=out)
+    inputs = {"asked": "", "settings": uptodate.digest(target.settings, target.picture)}
+    directory.create(target, force, Checkpoint(state, lens.field.spaces, provenance(target, device), {}, inputs))
+    designed = lens.heights if before is None else before.designed
+    correction.write(out, correction.Correction(made - lens.heights, designed, history))
+    comparison.write_plot(out / PLOT, judged.shown, np.asarray(lens.target), found, lens.encoding)
+    target.hold.close()
+    return {"project": str(out), "correction": figures | {"plot": str(out / PLOT)}, "photo": judged.figures}
+
+
+def refuse_bad_fit(judged: Judged) -> None:
+    """Refuse a photograph that the model does not explain.
+
+    Raises:
+        CausticError: it does not.
+    """
+    if (explained := judged.found.explained) < EXPLAINED:
+        raise CausticError(
+            f"is explained badly by a deviation of the part: {explained:.1%} of its variance, where {EXPLAINED:.0%} are needed;"
+            " nothing is corrected"
+        )
+
+
+def corrected_heights(project: Project, lens: Lens, judged: Judged, device: str) -> Tensor:
+    """H', within the limits of the design, (n, m) mm.
+
+    Raises:
+        CausticError: there are none.
+    """
+    guess, before = judged.found.guess, judged.before
+    designed = lens.heights if before is None else before.designed
+    off = deviation(lens.field, guess.modes)
+    wanted = designed - (off - off.mean())
+    wanted = wanted.mean() + (wanted - wanted.mean()) / (1.0 + guess.scale)
+    if before is not None:
+        wanted = wanted - (before.deviation - before.deviation.mean())
+    assert lens.state is not None
+    feasible = problem_of(project, device).feasible(lens.state.stage, wanted.to(lens.heights.dtype))
+    return rounded(feasible.detach().cpu())
+
+
+def predicted(lens: Lens, judged: Judged, heights: Tensor) -> dict[str, Any]:
+    """Predicted errors of the picture of the part as it is and of a part of H', each with its standard deviation: registered and in
+    the frame of the screen; gain and its standard deviation, of registered errors; and how far H' is from H, RMS in µm."""
+    known = judged.before.deviation if judged.before is not None else torch.zeros_like(lens.heights)
+    target = np.asarray(lens.target)
+    rays = max(LEAST, EACH * target.size)
+
+    def errors(sent: Tensor, guess: Guess) -> tuple[float, float]:
+        part = scaled(sent + known, guess.scale) + deviation(lens.field, guess.modes)
+        image = retrace(lens.scene, lens.field, part, target, rays=rays, seed=lens.seed, noise=False)[0].image.cpu().numpy()
+        aim = target / target.mean()
+        return relative_rms(comparison.registered(image / image.mean(), aim), aim), relative_rms(image, target)
+
+    draws = judged.found.draws(DRAWS)
+    now, then = (np.array([errors(sent, guess) for guess in draws]) for sent in (lens.heights, heights))
+    gain = now[:, 0] - then[:, 0]
+    moved = heights - lens.heights
+
+    def both(values: np.ndarray) -> list[float]:
+        return [float(values.mean()), float(values.std(ddof=1))]
+
+    return {
+        "registered": both(now[:, 0]),
+        "predicted": both(then[:, 0]),
+        "error": both(now[:, 1]),
+        "predicted_error": both(then[:, 1]),
+        "gain": both(gain),
+        "moved_um": 1e3 * float((moved - moved.mean()).square().mean().sqrt()),
+    }
+
+
+def refuse_uncertain(figures: dict[str, Any]) -> None:
+    """Refuse a correction whose gain is within its uncertainty.
+
+    Raises:
+        CausticError: it is.
+    """
+    (gain, sigma), (now, _), (then, left) = figures["gain"], figures["registered"], figures["predicted"]
+    if not gain > CERTAIN * sigma or math.isnan(gain):
+        raise CausticError(
+            f"leaves nothing to correct for certain: the registered error of the part is {now:.3f}, and a corrected one would have"
+            f" {then:.3f} ± {left:.3f}, a gain of {gain:.3f} ± {sigma:.3f}; nothing is written"
+        )
+
+
+def rows(figures: dict[str, Any]) -> list[tuple[str, str]]:
+    """Rows of the closing table."""
+    f = figures["correction"]
+    said = {name: f"{f[name][0]:.4f} ± {f[name][1]:.4f}" for name in ("registered", "predicted", "error", "predicted_error")}
+    return [
+        ("round", str(f["round"])),
+        ("error of this part", f"{said['registered']} registered, {said['error']} in the frame of the screen"),
+        ("predicted of the next", f"{said['predicted']} registered, {said['predicted_error']} in the frame of the screen"),
+        ("heights moved by", f"RMS {f['moved_um']:.2f} µm"),
+        ("plot", f["plot"]),
+    ]

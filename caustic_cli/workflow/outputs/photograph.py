@@ -1,0 +1,92 @@
+"""A photograph of the caustic of the part that was made: on the screen, compared with the picture, and errors of the part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+from caustic_cli.io.picture import WIDE, write_image, write_npy
+from caustic_cli.scene.traits import Capability
+from caustic_cli.studies.photograph import comparison
+from caustic_cli.studies.photograph.registration import read_codes
+from caustic_cli.workflow.lens import Lens
+from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
+from caustic_cli.workflow.photographs import PHOTOGRAPHS, corners_of, judge, refuse_lens
+
+
+@dataclass(eq=False)
+class PartPhotograph(Output):
+    """The photograph `photo`, found on the screen by `marks`, a file or auto, or by `screen_corners`."""
+
+    option: ClassVar[str] = "photo"
+    capability: ClassVar[Capability] = PHOTOGRAPHS
+    files: ClassVar[tuple[str, ...]] = ("photo.png", "photo.npy", "missing.png", "part.png", "part.npy", "deviation.npy")
+    beyond: ClassVar[bool] = True
+
+    photo: Path
+    marks: str | None = None
+    screen_corners: tuple[str, str, str, str] | None = None
+    codes: np.ndarray | None = field(default=None, init=False)
+
+    @property
+    def asks(self) -> dict[str, object]:
+        marks = None if self.marks in (None, "auto") else fingerprint(str(self.marks))
+        return {"photo": fingerprint(self.photo), "marks": marks, "screen_corners": self.screen_corners}
+
+    def unsupported(self, lens: Lens) -> str:
+        return refuse_lens(lens)
+
+    def prepare(self, rendering: Rendering) -> None:
+        if self.marks not in (None, "auto") and corners_of(self.screen_corners) is not None:
+            raise InputError("⟨marks⟩ and ⟨screen_corners⟩ both say where the screen is: leave one out")
+        self.codes = read_codes(self.photo)
+
+    def write(self, rendering: Rendering) -> dict[str, Any]:
+        """photo: as of `workflow.photographs.Judged.figures`, with the paths of the files."""
+        lens, paths = rendering.lens, self.paths(rendering.place)
+        assert lens.target is not None
+        found = judge(lens, self.photo, self.marks, self.screen_corners, rendering.say, self.codes)
+        shown, white = found.shown, float(lens.target.max() / lens.target.mean())
+        made, deviation, _ = comparison.surfaces(found.found)
+        image, values, missing, plot, part, off = paths
+        write_image(image, shown.irradiance, white, lens.encoding, WIDE)
+        write_npy(values, shown.irradiance)
+        write_image(missing, shown.missing, white, lens.encoding, WIDE)
+        comparison.write_plot(plot, shown, lens.target, found.found, lens.encoding)
+        write_npy(part, made)
+        write_npy(off, deviation)
+        if lens.by_waves:
+            rendering.say.say("this lens was refined on its wave image; the photograph is compared with rays, blurred as it is")
+        names = ("image", "values", "missing_image", "plot", "part_file", "deviation_file")
+        return {"photo": found.figures | dict(zip(names, map(str, paths), strict=True))}
+
+    def show(self, figures: dict[str, Any], say: Any) -> None:
+        f = figures["photo"]
+        say.table(f"photograph {f['file']}", rows(f))
+
+
+def rows(f: dict[str, Any]) -> list[tuple[str, str]]:
+    """Rows of the closing table, from the figures of a photograph."""
+    part, camera = f["part"], f["camera"]
+    sigma = f", {f['mark_sigma_px']:.2g} pixels each" if f["marks"] else ""
+    found = [
+        ("screen found by", f"{f['registered_by']}{sigma}"),
+        ("error of the picture", f"{f['error']:.4f}; as photographed {f['as_photographed']:.4f}"),
+        ("after registration", f"{f['registered']:.4f}; against the lens as designed {f['against_lens']:.4f}"),
+        ("light missing", f"{f['missing_light']:.2%} of the picture's"),
+        ("camera", f"gamma {camera['gamma']:.2f}, background {camera['background']:.3f}, blur {camera['blur_mm']:.2g} mm"),
+        (
+            "deviation of the part",
+            f"RMS {part['deviation_rms_um']:.2f} ± {part['deviation_rms_sigma_um']:.2f} µm;"
+            f" known to {part['uncertainty_um']:.2f} µm",
+        ),
+        ("scale of the relief", f"{part['relief_scale']:.4f} ± {part['relief_scale_sigma']:.4f}, or throw, or index less one"),
+        ("explained", f"{part['explained']:.2%} of the photograph's variance"),
+    ]
+    found += [("not told apart", words) for words in part["not_told_apart"]]
+    names = ("image", "missing_image", "plot", "part_file", "deviation_file")
+    return found + [("files", ", ".join(f[name] for name in names))] if "plot" in f else found
