@@ -89,4 +89,4 @@ def rows(f: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     found += [("not told apart", words) for words in part["not_told_apart"]]
     names = ("image", "missing_image", "plot", "part_file", "deviation_file")
-    return found + [("files", ", ".join(f[name] for name in names))] if "plot" in f else found
+    return [*found, ("files", ", ".join(f[name] for name in names))] if "plot" in f else found
