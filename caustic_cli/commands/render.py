@@ -117,6 +117,14 @@ class OutputOptions(options.Given):
             " beside the image.  Of a lamp, isolux lines, polar diagram, sections and losses: report.png.",
         ),
     ] = False
+    shop: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="HTML",
+            help="Also write a page for the shop that makes the part: drawing, blank, what has to be held, how it is finished and"
+            " photographed; with a test card beside it.",
+        ),
+    ] = None
     tool_radius: Annotated[
         float | None,
         typer.Option(

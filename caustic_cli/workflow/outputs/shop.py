@@ -1,0 +1,46 @@
+"""The page for the shop that makes the part, HTML, with the test card beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from caustic_cli.io.files import destination
+from caustic_cli.scene.traits import Capability
+from caustic_cli.studies import manufacture, shop_page
+from caustic_cli.studies.photograph.card import write_card
+from caustic_cli.workflow.outputs.base import Output, Place, Rendering, single
+
+
+@dataclass(eq=False)
+class ShopPage(Output):
+    """The page at `shop`; beside it NAME-card.png and NAME-card.csv."""
+
+    option: ClassVar[str] = "shop"
+    capability: ClassVar[Capability] = single("page for the shop", "shop")
+    beyond: ClassVar[bool] = True
+
+    shop: Path
+
+    def __post_init__(self):
+        destination(self.shop)
+
+    def paths(self, place: Place) -> tuple[Path, ...]:
+        return (self.shop, *(self.shop.with_name(f"{self.shop.stem}-card{suffix}") for suffix in (".png", ".csv")))
+
+    def write(self, rendering: Rendering) -> dict[str, Any]:
+        """shop: page and card, and the limits of `studies.shop_page`."""
+        lens, (page, sheet, table) = rendering.lens.origin.read({}), self.paths(rendering.place)
+        surface = rendering.lens.origin.made(lens.field, lens.heights)
+        project = rendering.lens.project
+        report = manufacture.manufacture(lens.scene, *surface, seed=rendering.seed)
+        card = write_card(sheet, table, lens.scene.screen.half_size, lens.scene.screen.shift)
+        title, finish = rendering.place.lens.resolve().stem, project.settings.lens.finish if project else ""
+        limits = shop_page.write_page(page, title, lens.scene, *surface, report, finish, card)
+        return {"shop": {"page": str(page), "card": str(sheet)} | limits}
+
+    def show(self, figures: dict[str, Any], say: Any) -> None:
+        f = figures["shop"]
+        bumps = "; ".join(f"{height:.2g} µm over {width:g} mm" for width, height in f["bumps_um"].items())
+        say.table("for the shop", [("page", f["page"]), ("test card", f["card"]), ("bumps lower than", bumps)])
