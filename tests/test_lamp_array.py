@@ -12,7 +12,7 @@ from helpers import edges_of, read_step, step_in_opencascade
 from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import lamp_mesh
-from caustic_cli.export.lamp_mitsuba import write_lamp_mitsuba
+from caustic_cli.export.lamp_mitsuba import plane_of, write_lamp_mitsuba
 from caustic_cli.export.lamp_step import write_lamp_step
 from caustic_cli.io.photometry import read_photometry
 from caustic_cli.optics.lamp import LampLight, emissions, through
@@ -20,7 +20,7 @@ from caustic_cli.optics.lamp_array import among, meets_neighbour
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.studies.lamp import lamp_image
-from caustic_cli.studies.lamp_verify import _emitted
+from caustic_cli.studies.lamp_verify import _emitted, verify_lamp
 
 FIELD = PolarField.uniform((12, 9), (3, 4))
 NOISE = torch.randn(FIELD.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -101,6 +101,16 @@ def test_a_scene_for_mitsuba_has_all_chips(tmp_path):
     origin, _ = _emitted(lamp, 60_000, np.random.default_rng(1))
     cells = np.unique(np.rint((origin[:2].T - lamp.places.min(0)) / lamp.pitch), axis=0, return_counts=True)
     assert len(cells[0]) == 6 and cells[1].min() > 9500
+
+
+def test_mitsuba_agrees(tmp_path):
+    """Only where Mitsuba is installed: light of all lamps, without that which meets another lens."""
+    pytest.importorskip("mitsuba", exc_type=ImportError)
+    lamp = Lamp(Chip("rectangle", (1.0, 2.0)), base=2.0, array=(2, 1), pitch=(31.0, 31.0))
+    for goal in (Goal((900.0, 600.0), 400.0), Goal((160.0, 100.0))):
+        write_lamp_mitsuba(tmp_path / "a.xml", lamp, goal, FIELD, VALUES, (24, 16), (300, 1200), dark=True)
+        found = verify_lamp(tmp_path / "a.xml", lamp, plane_of(goal, lamp.radius), FIELD, VALUES, (24, 16), 100_000)
+        assert found.agree and 0.8 < found.figures["z_mean_square"] < 1.2, found.figures
 
 
 # Its light

@@ -119,7 +119,8 @@ and for a uniform one the cone if that is given, else all directions; for severa
 .TP
 .B interior_rms, interior_noise, border, uniformity, cut_off, uncoated_limit, least_wall, greatest_radius, peak_candela, beam_angles
 Of a lamp, whose of_source and the entries of lost sum to 1: relative_rms, which is over pixels that are lit entirely, without a
-border of the target, 2.5 % of its smaller side or what a chip blurs, and its noise; that border, mm or degrees; least over mean
+border of the target, 2.5 % of its smaller side or what a chip blurs, and its noise; that border, in border_unit;
+least over mean
 illuminance, or intensity in the far field; there the angle over which it falls from 90 to 10 % at its upper edge; the light that
 uncoated surfaces pass at normal incidence; least distance of its surfaces and greatest radius, mm; in the far field candela for a
 chip of 1000 lm, and full

@@ -395,7 +395,7 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         value = figures.get(key)
         return "-" if value is None else format(value, form)
 
-    lost = {name.replace("_", " "): part for name, part in figures["lost"].items() if part > 0}
+    lost = {name.replace("_", " "): part for name, part in figures["lost"].items() if part > 1e-9}
     width, height = figures["pixels"]
     found = [
         ("on target", f"{figures['of_source']:.2%} of all light; uncoated limit {figures['uncoated_limit']:.2%}"),
