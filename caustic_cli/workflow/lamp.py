@@ -116,7 +116,8 @@ class LampDesign:
         shaded = len(np.unique(self.picture[self.picture > 0])) > 1
         intensities = IntensitySum()
         how: dict[str, Any] = {"shaded": shaded, "rays": rays, "seed": seed, "also": intensities.add}
-        found, figures = lamp_figures(self.lamp, self.goal, self.field, self.values, fine, coarse, **how)
+        with one_thread():  # the tensors of a chunk of rays are too small for more
+            found, figures = lamp_figures(self.lamp, self.goal, self.field, self.values, fine, coarse, **how)
         table = intensities.table()
         return Evaluation(found.image, fine, table, figures | table.figures)
 
