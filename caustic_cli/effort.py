@@ -112,7 +112,7 @@ class Effort:
         (24_000, 250_000, 110, 0.015),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.
-    chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_000, 400_000, 70, 0.035),)
+    chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_100, 300_000, 90, 0.045),)
     #: Spans of the spline along both axes in a stage with enough pixels; cells of the light along both axes for the transport;
     #: pixels by which the uniformity of the light is judged.
     lamp_spans: int = 64

@@ -472,7 +472,7 @@ def test_a_net_of_more_spans_is_the_same_surface():
 
 def test_a_lamp_is_judged_on_pixels_half_as_wide_as_those_refined():
     goal = Goal((30_000.0, 10_000.0), 8000.0)
-    for lamp, (across, along) in ((Lamp(), (268, 90)), (Lamp(Chip("disc", (1.0, 1.0))), (95, 32))):
+    for lamp, (across, along) in ((Lamp(), (268, 90)), (Lamp(Chip("disc", (1.0, 1.0))), (96, 32))):
         assert judged_pixels(lamp, goal, STANDARD) == (2 * across, 2 * along)
 
 

@@ -38,7 +38,7 @@ MARGIN = 0.005
 #: Dark pixels around the target on which light beside it is seen; and the filter of the image.
 APRON, FILTER = 4, Filter("cosine", (3, 3))
 #: Points of a chip along both of its axes; weight of the pixels on the border that it blurs, and of the apron.
-CHIP_POINTS, BLURRED = 8, 0.005
+CHIP_POINTS, BLURRED = 8, 0.015
 #: Least pixels of a stage per square of a span of the spline: finer waves than pixels show would grow unseen, and cost most of the
 #: iterations of the following stage.
 PER_SPAN = 3

@@ -1,7 +1,8 @@
 """What the size of a chip allows a lamp, estimated before its design: blur, least error behind it, and etendue.
 
 Every point of the free-form surface sees the chip under an angle of about its size over the distance, and sends an image of that
-width to the target.  The error of every picture that is blurred so is bounded from below (`deconvolution`).
+width to the target.  The error of every picture that is blurred so is bounded from below (`deconvolution`), and with its edges that
+of one beside which little light falls.
 
 Etendue is conserved: a Lambertian chip of area A has pi A.  The lens lies within the half ball of its greatest radius R, whose
 area seen from an angle theta to the axis is pi R^2 (1 + cos theta) / 2, so that the target takes no more than the integral of this
@@ -23,10 +24,9 @@ from caustic_cli.scene.lamp import Goal, Lamp
 
 #: Pixels of the target.
 PIXELS = 3000
-#: Part of the light on the picture up to which light beside it is allowed where its edges count, and prices of it that are tried.
-BESIDE, PRICES = 0.01, (0.1, 0.2, 0.4)
-#: Least error of this kind that is told.
-LEAST_TOLD = 0.01
+#: Most light beside the picture, over that on it, for the error with its edges, prices of it that are tried (`error_bound`), and
+#: least error of this kind that is told.
+BESIDE, PRICES, LEAST_TOLD = 0.01, (0.1, 0.2, 0.4), 0.01
 
 
 def etendue_limit(lamp: Lamp, goal: Goal) -> float:
@@ -74,6 +74,6 @@ def chip_limits(lamp: Lamp, goal: Goal, picture: np.ndarray, most: int) -> Itera
         yield f"by etendue, at most {part:.0%} of the light can reach the picture through a lens of this radius"
     elif (error := least_error(lamp, goal, picture, most, BESIDE)) > LEAST_TOLD:
         yield (
-            f"with its edges, no picture has one of less than {at_most(error, 2)} unless more than {BESIDE:.0%} of the light falls"
-            " beside it"
+            f"with its edges, no picture has a relative RMS error of less than {at_most(error, 2)} behind this blur, unless more"
+            f" than {BESIDE:.0%} of the light falls beside it"
         )

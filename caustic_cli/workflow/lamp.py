@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -119,7 +118,7 @@ class LampDesign:
         shaded = len(np.unique(self.picture[self.picture > 0])) > 1
         intensities = IntensitySum()
         how: dict[str, Any] = {"shaded": shaded, "rays": rays, "seed": seed, "also": intensities.add}
-        with one_thread() if self.lamp.ghosts else nullcontext():  # the tensors of light that is followed further are small
+        with one_thread():  # the tensors of a chunk of rays are too small for more
             found, figures = lamp_figures(self.lamp, self.goal, self.field, self.values, fine, coarse, **how)
         table = intensities.table()
         return Evaluation(found.image, fine, table, figures | table.figures)

@@ -5,7 +5,7 @@
 Every lamp is designed by the command's own defaults from acrylic with a radius of 15 mm and judged by rays that the design did not
 use, whose noise is subtracted: with the images A and B of two halves of them and the target T, each over its mean, the mean of
 (A - T) (B - T) is the squared error.  +- is what the noise leaves of it.  Light is a fraction of all that the chip emits, with all
-losses of uncoated surfaces.  Seconds are those of the processor, and of the clock, of the design without its verdict.
+losses of uncoated surfaces.  Seconds are those of the processor, and of the clock, of the design with its own verdict.
 
 The files of a lamp's light (`ldt`) are written, designed for, and written again: the root mean square of the difference of their
 candela, each file scaled to the same light, over that of the first file, each direction weighted with its solid angle.
@@ -74,11 +74,23 @@ def processor() -> float:
     return sum(used.ru_utime + used.ru_stime for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
 
 
+#: Designs of this run, by target and options.
+MADE: dict[str, Any] = {}
+
+
+def designed(target: Any, options: dict[str, Any]) -> tuple[Any, float, float]:
+    """A lamp, and the seconds of the processor and of the clock that it took."""
+    asked = repr((target, options))
+    if asked not in MADE:
+        began, clock = processor(), time.monotonic()
+        lamp = caustic_cli.design(target, **options)
+        MADE[asked] = lamp, processor() - began, time.monotonic() - clock
+    return MADE[asked]
+
+
 def measured(problem: Problem, rays: float) -> dict[str, Any]:
     """Figures of a problem."""
-    began, clock = processor(), time.monotonic()
-    lamp = caustic_cli.design(problem.target, **problem.options)
-    seconds, wall = processor() - began, time.monotonic() - clock
+    lamp, seconds, wall = designed(problem.target, problem.options)
     return lamp.render(rays, seed=11).figures | {"seconds": seconds, "wall": wall}
 
 
@@ -94,10 +106,8 @@ def passage(target: Any, options: dict[str, Any]) -> dict[str, float]:
     """Difference of the file of a lamp and that of the lamp designed for it."""
     with tempfile.TemporaryDirectory() as folder:
         first, second = (Path(folder) / f"{name}.ldt" for name in ("first", "second"))
-        caustic_cli.design(target, **options).export(first)
-        began = processor()
-        lamp = caustic_cli.design(str(first), lamp=15)
-        seconds = processor() - began
+        designed(target, options)[0].export(first)
+        lamp, seconds, _ = designed(str(first), {"lamp": 15})
         lamp.export(second)
         return {"difference": difference(first, second), "of_source": lamp.figures["of_source"], "seconds": seconds}
 
