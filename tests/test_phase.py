@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,6 +60,28 @@ def test_files_hold_it(tmp_path):
     edges = np.sort(np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3), 1)
     pairs = np.concatenate([edges[:, [0, 1]], edges[:, [1, 2]], edges[:, [0, 2]]])
     assert (np.unique(pairs, axis=0, return_counts=True)[1] == 2).all()  # closed
+
+
+def test_levels_are_the_nearest_phases(tmp_path):
+    """Four steps; of a linear phase 0.81 of the light goes to its order, sinc^2(1 / 4), as the far field of the file says."""
+    path, lens = tmp_path / "beam.phase.png", lens_of(Gaussian((1.0, 1.0), NM), lambda x, y: (x + 0.0 * y) / 150.0)
+    write_phase(path, *lens, (2000, 8), levels=4)
+    wrapped, whole = np.load(companions(path)[0]), phase_of(*lens, (2000, 8))
+    assert set(np.unique(wrapped / (0.5 * math.pi)).round(9)) == {0.0, 1.0, 2.0, 3.0}
+    assert np.abs(np.angle(np.exp(1j * (wrapped - whole)))).max() <= 0.25 * math.pi * 1.001
+    assert np.abs(np.exp(1j * (wrapped - whole)).mean()) ** 2 == pytest.approx(np.sinc(0.25) ** 2, rel=1e-2)
+    with Image.open(path) as picture:
+        assert set(np.unique(np.asarray(picture))) == {0, LEVELS // 4, LEVELS // 2, 3 * LEVELS // 4}
+    assert json.loads(companions(path)[1].read_text())["levels"] == 4
+    with pytest.raises(InputError, match="levels"):
+        write_phase(path, *lens, (20, 8), levels=1)
+
+
+def test_that_of_a_picture_in_the_far_field_is_the_same():
+    scene, field, heights = lens_of(Gaussian((1.0, 1.0), NM))
+    far = replace(scene, screen=replace(scene.screen, z=1000.0, far=True))
+    near = replace(scene, screen=replace(scene.screen, z=1000.0))
+    assert phase_of(far, field, heights, (30, 20)) == pytest.approx(phase_of(near, field, heights, (30, 20)), abs=1e-6)
 
 
 def test_by_default_it_is_resolved_and_too_many_pixels_are_refused():

@@ -28,6 +28,7 @@ TAKERS: dict[str, Sequence[str]] = {
     "samples": [name for name in FORMATS if name not in UNSAMPLED],
     "tolerance": WITHIN,
     "max_size": [name for name in FORMATS if name not in ("phase", "gcode")],
+    "levels": ("phase",),
     "script": ("lighttools",),
     "milling": ("gcode",),
 }
@@ -89,6 +90,13 @@ class ExportOptions(options.OfDesign, options.Debugging):
         float | None,
         typer.Option(
             metavar="MM", help="Mirror or mould: least material behind the surface.  [default: a fifth of the larger side]"
+        ),
+    ] = None
+    levels: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="phase: values of the phase in a turn, 2 to 65536, as of a modulator or of etched steps.  [default: 65536]",
         ),
     ] = None
     milling: Annotated[dict[str, Any], options.FieldOptions(Milling)]
@@ -206,6 +214,7 @@ def _given(asked: ExportOptions, formats: list[str]) -> dict[str, Any]:
         "block": asked.block,
         "samples": tuple(options.both(options.counts("--samples", asked.samples))) if asked.samples else None,
         "tolerance": asked.tolerance,
+        "levels": asked.levels,
         "milling": asked.milling or None,
     }
     return {name: value for name, value in given.items() if value is not None}

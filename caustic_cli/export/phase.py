@@ -9,6 +9,9 @@ a thin element there adds to the light, whose field it multiplies by exp(i phi).
     NAME.phase.npy      rad, (n, m) float64, [i, j] with i along +x and j along +y, at the centres of the pixels
     NAME.phase.json     pixel pitch, mm, wavelength, nm, levels, and the largest step between neighbouring pixels, rad
     NAME.phase.stl      the relief of height phi lambda / 2 pi (n - 1) on a plate of the lens' glass and least thickness, mm
+
+With fewer levels all of them hold the nearest of so many phases, evenly spaced in a turn: of a kinoform of N steps, whose
+efficiency is sinc^2(1 / N), as the rest goes to other orders.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +38,7 @@ from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves.image import lines_of
 from caustic_cli.optics.waves.wavefront import Optics, distance_of, survey, wavefront
 from caustic_cli.scene import Scene
+from caustic_cli.schema import checks
 
 #: Values of a picture's pixel, one turn of the phase.
 LEVELS = 1 << 16
@@ -53,6 +58,7 @@ def phase_of(scene: Scene, field: HeightField, heights: Tensor, samples: tuple[i
         InputError: there are too many pixels.
         NoWaveImage: rays cross in front of the plane.
     """
+    scene = scene.onto(replace(scene.screen, far=False))  # the phase is that of the lens, whatever is behind it
     line = lines_of(scene, field)[0]
     plane, parameters = Receiver.of(line.system, scene.screen).plane, {EXIT: heights.double()}
     mode = central_mode(line.system)
@@ -88,21 +94,28 @@ def _enough(optics: Optics, length: float) -> tuple[int, int]:
 
 
 def write_phase(
-    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | int | None = None
+    path: str | Path,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | int | None = None,
+    levels: int = LEVELS,
 ) -> None:
-    """Write the four files, each atomically; samples: pixels along x and y.
+    """Write the four files, each atomically; samples: pixels along x and y; levels: of the phase, 2 to LEVELS.
 
     Raises:
-        InputError, NoWaveImage: as of `phase_of`; or a file cannot be written there.
+        InputError, NoWaveImage: as of `phase_of`; the levels are out of range; or a file cannot be written there.
     """
-    path = Path(path)
+    path, levels = Path(path), checks.whole("⟨levels⟩", levels, 2, LEVELS)
     phase, length = phase_of(scene, field, heights, samples), 1e-6 * lines_of(scene, field)[0].wavelength
     wrapped = phase % (2.0 * math.pi)
+    if levels < LEVELS:
+        wrapped = np.rint(wrapped * (levels / (2.0 * math.pi))) % levels * (2.0 * math.pi / levels)
     info = PngImagePlugin.PngInfo()
     info.add_text("Software", SOFTWARE)
-    levels = (np.rint(wrapped * (LEVELS / (2.0 * math.pi))).astype(np.int64) % LEVELS).astype(np.uint16)
+    counts = (np.rint(wrapped * (LEVELS / (2.0 * math.pi))).astype(np.int64) % LEVELS).astype(np.uint16)
     with atomic_file(path) as file:
-        Image.fromarray(np.ascontiguousarray(levels.T[::-1])).save(file, format="PNG", pnginfo=info)
+        Image.fromarray(np.ascontiguousarray(counts.T[::-1])).save(file, format="PNG", pnginfo=info)
     array, said, relief = companions(path)
     held = io.BytesIO()
     np.save(held, wrapped)
@@ -114,7 +127,8 @@ def write_phase(
         "wavelength_nm": 1e6 * length,
         "pixels": list(phase.shape),
         "pixel_pitch_mm": pitch,
-        "levels": LEVELS,
+        "levels": levels,
+        "values_of_a_turn": LEVELS,
         "orientation": "seen from +z: columns run along +x, rows along -y; the field is multiplied by exp(i phase)",
         "largest_step_rad": max(float(np.abs(np.diff(phase, axis=k)).max()) for k in (0, 1)),
         "relief_height_mm": length / (scene.lens.inside - 1.0),

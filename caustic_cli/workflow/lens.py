@@ -241,6 +241,7 @@ class Lens:
         mould: bool = False,
         block: float | None = None,
         milling: dict | None = None,
+        levels: int | None = None,
     ) -> Path:
         """Export the lens; the format follows from the suffix (.step, .stl, .npz, ...) unless it is given.
 
@@ -248,10 +249,12 @@ class Lens:
             samples: points along x and y, for sampled formats; tolerance: for meshes instead, mm; for step, 0 for the exact spline.
             script: for lighttools: also write a script that rebuilds the scene.
             mould: the negative; block: least material behind a mirror or a mould, mm; milling: for gcode, see `export.milling`.
+            levels: for phase: of a turn.
         """
         path = Path(path)
         name = format_of(path, format)
-        given: dict[str, Any] = {key: value for key, value in (("samples", samples), ("tolerance", tolerance)) if value is not None}
+        each = (("samples", samples), ("tolerance", tolerance), ("levels", levels))
+        given: dict[str, Any] = {key: value for key, value in each if value is not None}
         exporter = Exporter(self.scene, *self.made, self.target, self.by_waves, self.seed)
         exporter.write(path, name, script, mould, block, milling, **given)
         return path

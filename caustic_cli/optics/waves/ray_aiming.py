@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -31,7 +32,8 @@ def aimed_rays(
     a ray moves back towards its last unblocked position, or else towards the centre of the light.
     """
     x, y = at
-    u, v = seen.toward(*(c - o for c, o in zip(at, seen.offset, strict=True)))
+    u, v = seen.aim(x, y)
+    toward = seen.toward if seen.places is None else _local(u, v, shape, step)
     middle = seen.toward(*(0.5 * (seen.light[0][k] + seen.light[1][k]) - seen.offset[k] for k in (0, 1)))
     found, behind = torch.zeros_like(x, dtype=torch.bool), torch.zeros_like(x, dtype=torch.bool)
     held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
@@ -55,7 +57,7 @@ def aimed_rays(
         far = inside & (0.5 * ((x - f.x).square() + (y - f.y).square()) * curvature > left)
         if not bool(far.any()) and (k + 1 >= AT_EDGES or not bool(behind.any())):
             break
-        ahead = [h + move for h, move in zip(here, seen.toward(x[some] - new.x, y[some] - new.y), strict=True)]
+        ahead = [h + move for h, move in zip(here, toward(x[some] - new.x, y[some] - new.y, some), strict=True)]
         for c, a, h, kept, m in zip((u, v), ahead, here, held, middle, strict=True):
             c[some] = torch.where(lit, a, torch.where(ever, 0.5 * (h + kept[some]), h + INWARDS * (m - h)))
         some = (far | ~inside).nonzero()[:, 0]
@@ -63,6 +65,17 @@ def aimed_rays(
         some = behind.nonzero()[:, 0]
         f = f.updated(some, optics.intercepts(*(h[some] for h in held), sensitive))
     return f, held, behind
+
+
+def _local(u: Tensor, v: Tensor, shape: tuple[int, int], step: tuple[float, float]) -> Callable[..., tuple]:
+    """As of `Survey.toward`, by the changes of u and v (N,) along the grid."""
+    by = [[g.reshape(-1) for g in torch.gradient(c.view(shape), spacing=step, dim=(0, 1))] for c in (u, v)]
+
+    def toward(x: Tensor, y: Tensor, some: Tensor | slice) -> tuple[Tensor, Tensor]:
+        a, b = (gx[some] * x + gy[some] * y for gx, gy in by)
+        return a, b
+
+    return toward
 
 
 def _curvature(f, shape: tuple[int, int], step: tuple[float, float]) -> Tensor:

@@ -31,9 +31,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.effects import Requests
 from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.interaction import Interaction, Parameters
@@ -47,6 +49,7 @@ from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Pupil
 from caustic_cli.scene.screen import passed_by
 
+interpolate_nd = OnDemand("scipy.interpolate")
 #: Points along each side of the pupil for a survey; fraction of rays outside the quantiles `mostly`.
 SURVEY, FEW = 65, 0.01
 #: Tolerance of ray aiming: error of the optical path relative to the wavelength.
@@ -59,6 +62,9 @@ CROSSES = (
 )
 #: Part of the scale up to which the skew of the map from pupil to intercepts is left to the iterations of ray aiming.
 STRAIGHT = 0.05
+#: Deviation of the local magnification from pupil to intercepts from its mean, relative, from which on the iterations of ray aiming
+#: begin at the survey's rays, with their local magnification.
+UNEVEN = 0.7
 #: Tolerated displacement from the grid at the edges of dark regions, in cells.
 AT_EDGE = 0.05
 #: Rays per chunk.
@@ -193,8 +199,9 @@ class Survey:
 
     light, landing: lower and upper limits of intercepts and of landing points, mm; offset, scale: linear fit x = offset + scale u
     from the pupil's u and v, in [0, 1], to intercepts along each axis; skew: and their change along the other one, 0 where it is
-    small; magnification: square root of the mean area of landing
-    points over that of intercepts; mostly: limits of landing points without the fraction FEW of rays on each side.
+    small; magnification: square root of the mean area of landing points over that of intercepts; mostly: limits of landing points
+    without the fraction FEW of rays on each side; places: where the intercepts are far from that fit, as behind two surfaces that
+    reshape a beam, u, v, x, y of the survey's rays, (N,) each.
     """
 
     light: tuple
@@ -204,9 +211,22 @@ class Survey:
     magnification: float
     mostly: tuple
     skew: tuple[float, float] = (0.0, 0.0)
+    places: tuple[Tensor, ...] | None = None
 
-    def toward(self, x, y) -> tuple:
-        """Changes of u and v for changes of the intercepts, mm, tensors or numbers."""
+    def aim(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """u and v for intercepts (N,), mm: of the fit, or where there are `places` linear between them."""
+        linear = self.toward(x - self.offset[0], y - self.offset[1])
+        if self.places is None:
+            return linear
+        u, v, *of = (c.cpu().numpy() for c in self.places)
+        at = np.stack([c.cpu().numpy() for c in (x, y)], -1)
+        found = interpolate_nd.LinearNDInterpolator(np.stack(of, -1), np.stack([u, v], -1))(at)
+        return tuple(
+            torch.where(torch.isfinite(c), c, a) for c, a in zip(torch.from_numpy(found).to(x).unbind(-1), linear, strict=True)
+        )  # type: ignore[return-value]
+
+    def toward(self, x, y, _some: Tensor | slice = slice(None)) -> tuple:
+        """Changes of u and v for changes of the intercepts, mm, tensors or numbers; of which rays does not matter."""
         (a, d), (b, c) = self.scale, self.skew
         if not (b or c):
             return x / a, y / d
@@ -258,7 +278,10 @@ def survey(optics: Optics) -> Survey:
     weight = f.power.view(grid)
     magnification = float((weight * area).sum() / (weight * foot).sum()) ** 0.5
     mostly = tuple(tuple(float(torch.quantile(c[lit], q)) for c in (f.big_x, f.big_y)) for q in (FEW, 1.0 - FEW))
-    return Survey(light, landing, (offset[0], offset[1]), (scale[0], scale[1]), magnification, mostly, (skew[0], skew[1]))
+    stretched = [torch.gradient(c.view(grid), spacing=1.0 / (SURVEY - 1), dim=k)[0].view(-1)[lit] for k, c in enumerate((f.x, f.y))]
+    uneven = any(float((g / s - 1.0).abs().max()) > UNEVEN for g, s in zip(stretched, scale, strict=True))
+    places = tuple(c[lit] for c in (u, v, f.x, f.y)) if uneven and not any(skew) else None
+    return Survey(light, landing, (offset[0], offset[1]), (scale[0], scale[1]), magnification, mostly, (skew[0], skew[1]), places)
 
 
 def _centred(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
