@@ -50,8 +50,9 @@ def test_value(pixels, goal):
     loss = Loss("log-rms", torch.from_numpy(target), bright=Region(goal, pixels))
     error, light = of_numpy(image, target, pixels)
     found = float(loss(torch.from_numpy(image), torch.tensor(1.0, dtype=torch.float64))) * target.size
-    short = max(0.0, goal + BEYOND - light)
-    assert (short > 0) == (goal == 0.99)
+    _, own = of_numpy(target / target.sum(), target, pixels)
+    short = max(0.0, goal * own + BEYOND - light)
+    assert (short > 0) == (goal == 0.99) and (own < 0.99) == (pixels == 0)
     assert found**2 == pytest.approx(math.log1p((error / LEAST) ** 2) + WEIGHT * short**2, rel=1e-12)
 
 

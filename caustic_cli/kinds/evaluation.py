@@ -114,10 +114,12 @@ class LensEvaluation:
         if (how := self.problem.stages[-1].rendering.bright) is None or self.target.ndim > 2:
             return
         bright, scene, seen = how.on(self.problem.target), self.problem.scene, self.light or self.exposure
-        self.figures["beam"] = beams.beam_figures(seen.image, float(seen.leaving), bright, scene.screen.pixel)
+        image, more = seen.image, {}
         if self.light is not None and scene.screen.upright:
-            heights = self.state.heights
-            self.figures["beam"]["vortices"] = beams.vortices(scene, self.field, heights, bright.mask.numpy())
+            lens = scene, self.field, self.state.heights
+            if (found := beams.image_at(*lens, (bright.mask | bright.region).numpy())) is not None:
+                image, more = found, {"vortices": beams.vortices(*lens, bright.mask.numpy())}
+        self.figures["beam"] = beams.beam_figures(image, float(seen.leaving), bright, scene.screen.pixel) | more
 
     @property
     def few(self) -> tuple[float, ...]:
