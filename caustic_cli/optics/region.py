@@ -74,11 +74,14 @@ class Bright:
         rows, columns = (lit.any(k).nonzero()[:, 0] for k in (1, 0))
         return (int(rows[0]), int(rows[-1]) + 1), (int(columns[0]), int(columns[-1]) + 1)
 
+    def ratio(self, image: Tensor) -> Tensor:
+        """I' / T of an image (n_x, n_y) at the pixels of the mask (n,)."""
+        inside, wanted = image[self.mask], self.target[self.mask]
+        return inside / wanted * (wanted.sum() / inside.sum())
+
     def error(self, image: Tensor) -> Tensor:
         """e of an image (n_x, n_y), ()."""
-        inside, wanted = image[self.mask], self.target[self.mask]
-        ratio = inside / wanted * (wanted.sum() / inside.sum())
-        return (ratio - 1.0).square().mean().sqrt()
+        return (self.ratio(image) - 1.0).square().mean().sqrt()
 
     def light(self, image: Tensor) -> Tensor:
         """Sum over the region, ()."""
