@@ -11,7 +11,7 @@ import torch
 
 from caustic_cli import cli
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.losses import BEYOND, LEAST, WEIGHT, Loss
+from caustic_cli.inverse.losses import BEYOND, DARK, DARKER, LEAST, WEIGHT, Loss
 from caustic_cli.optics.region import Region, dilated
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
@@ -50,9 +50,22 @@ def test_value(pixels, goal):
     loss = Loss("log-rms", torch.from_numpy(target), bright=Region(goal, pixels))
     error, light = of_numpy(image, target, pixels)
     found = float(loss(torch.from_numpy(image), torch.tensor(1.0, dtype=torch.float64))) * target.size
-    short = max(0.0, goal + BEYOND - light)
-    assert (short > 0) == (goal == 0.99)
+    _, own = of_numpy(target / target.sum(), target, pixels)
+    short = max(0.0, goal * own + BEYOND - light)
+    assert (short > 0) == (goal == 0.99) and (own < 0.99) == (pixels == 0)
     assert found**2 == pytest.approx(math.log1p((error / LEAST) ** 2) + WEIGHT * short**2, rel=1e-12)
+
+
+def test_much_darker_pixels_count_more():
+    target, image = pictures(5)
+    mask = target > 0.1 * target.max()
+    image[tuple(np.argwhere(mask)[7])] *= 0.05
+    found = (
+        float(Loss("log-rms", torch.from_numpy(target), bright=Region(0.2))(torch.from_numpy(image), torch.ones(()))) * target.size
+    )
+    ratio = image[mask] / target[mask] * (target[mask].sum() / image[mask].sum())
+    square = np.mean((ratio - 1.0) ** 2) + DARKER * np.mean(np.clip(1.0 - ratio / DARK, 0.0, None) ** 2)
+    assert found**2 == pytest.approx(math.log1p(square / LEAST**2), rel=1e-12)
 
 
 @pytest.mark.parametrize("goal", [0.7, 0.99])

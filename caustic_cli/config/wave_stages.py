@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.config.default_stages import LEAST_WAVES, LONGER, Table, on_waves, wave_refinement
+from caustic_cli.config.default_stages import LEAST_WAVES, LONGER_BEAMS, Table, on_waves, wave_refinement
 from caustic_cli.config.design import region_of
 from caustic_cli.config.exclusions import refuse_excluded, why_excluded
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen, build_source
@@ -43,7 +43,7 @@ def wave_stages(s: Settings, source: Source, effort: Effort, lit: tuple[float, f
     own, whole = tuple(map(float, s.source.get("wavelengths", ()))), light.continuum
     plan = wave_refinement(wave_samples(s, seen, lit), len(own), effort, timed=asked == "auto")
     if region_of(s.design) is not None:
-        plan = [(count, LONGER * n) for count, n in plan]
+        plan = [(count, LONGER_BEAMS * n) for count, n in plan]
     apron = math.ceil(0.04 * max(screen.resolution))
     return [on_waves(lens.control, own if own or whole is None else whole.rule(count)[0], apron, n) for count, n in plan]
 

@@ -11,9 +11,11 @@ Every term is a dimensionless root mean square t; r is the relative residual N (
     diffusion   the Laplacian of r, with P = P_out: penalises errors of high spatial frequency
     uniformity  standard deviation of J over its mean where the target is not dark (5.2)
     log-rms     the least relative error inside the picture at a given fraction of the light, for laser beams, see `Region`:
-                t^2 = log(1 + e^2 / e_0^2) + w max(0, a + m - b)^2, with e the relative error in the mask, b the fraction in the
-                region of the light that leaves the lens, a its goal and m a margin.  The second term, of rank one, acts below the
-                goal alone; the logarithm keeps the first in proportion to it at every error.  Light outside the region is free
+                t^2 = log(1 + (e^2 + d^2) / e_0^2) + w max(0, a + m - b)^2, with e the relative error in the mask, b the fraction in
+                the region of the light that leaves the lens, a that of the picture times the wanted efficiency, and m a margin.
+                The second term, of rank one, acts below the goal alone; the logarithm keeps the first in proportion to it at every
+                error.  d^2 = k mean(max(0, 1 - I' / (D T))^2) counts pixels that are much darker than the picture once more: a zero
+                of the field among them, a vortex, would remain.  Light outside the region is free
     laplacian, curvature    of the lens, see `penalties`
 
 Image and target may both be blurred, J -> G_x J G_y^T, so that the residual is compared at a coarser scale.
@@ -36,8 +38,9 @@ if TYPE_CHECKING:
 
 bright_parts = OnDemand("caustic_cli.optics.region")
 
-#: e_0, an error too small to matter; w and m of log-rms.
+#: e_0, an error too small to matter; w and m of log-rms; D and k.
 LEAST, WEIGHT, BEYOND = 1e-4, 1e6, 3e-4
+DARK, DARKER = 0.4, 3.0
 IN_THE_DARK = "no light reaches the bright part of the picture"
 
 
@@ -86,6 +89,7 @@ class Loss:
         self.box: tuple[tuple[int, int], tuple[int, int]] | None = None
         if any(name == "log-rms" for _, name in self.terms):
             self.bright = (bright or bright_parts.Region()).on(self.target, apron)
+            self.least = self.bright.goal * self.bright.own
             self.box = self.bright.box if len(self.terms) == 1 else None
         self.region = target > 0 if region is None else region
         beyond = [
@@ -123,9 +127,10 @@ class Loss:
         if name == "log-rms":
             if not float(image.detach()[self.bright.mask].sum()) > 0:
                 raise NoLight(f"{IN_THE_DARK}, so its relative error is undefined; check throw, mag and screen size")
-            error, part = self.bright.error(image), self.bright.efficiency(image) / leaving
-            short = (self.bright.goal + BEYOND - part).clamp_min(0.0)
-            return torch.log1p((error / LEAST) ** 2) + WEIGHT * short * short
+            ratio, part = self.bright.ratio(image), self.bright.light(image) / leaving
+            square = (ratio - 1.0).square().mean() + DARKER * (1.0 - ratio / DARK).clamp_min(0.0).square().mean()
+            short = (self.least + BEYOND - part).clamp_min(0.0)
+            return torch.log1p(square / LEAST**2) + WEIGHT * short * short
         if name == "uniformity":
             inside = image[self.region]
             if not float(inside.detach().sum()) > 0:  # a black region would count as uniform

@@ -37,6 +37,8 @@ from caustic_cli.scene import Scene
 
 #: Most bytes of transforms kept for the gradient; beyond, each is computed twice.
 KEPT = 1 << 30
+#: Oversampling where light outside the picture is free, so that it lies where it would be aliased into the picture.
+FINER = 1.5
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,8 @@ class WaveObjective:
         parameters = {EXIT: self.middle}
         with torch.no_grad():
             receiver = receiver_of(lines[0].system, screen)
-            self.imager = Imager.of(lines, parameters, receiver, watched=_lit(scene, target), dense=True)
+            finer = 1.0 if self.loss.box is None else FINER
+            self.imager = Imager.of(lines, parameters, receiver, finer, watched=_lit(scene, target), dense=True)
             self.changes: list[Any] = []
             self.fronts: list[Wavefront] = []
             self.parts = list(self._parts(lines[rank::count], parameters))
@@ -118,8 +121,8 @@ class WaveObjective:
         imager, box = self.imager, self.loss.box
         if box is not None and imager.receiver.across and not imager.spreading:
             shape, edges = imager.sampling.padded, imager.edges(line)
-            if pruning_pays(shape, imager.sampling.count, edges, box):
-                return PrunedExposure(*imager.field(line, front, self.dtype), TURN / line.length, shape, edges, box)
+            if pruning_pays(shape, imager.sampling.count, edges, box, True):
+                return PrunedExposure(*imager.field(line, front, self.dtype), TURN / line.length, shape, edges, box, True)
         return imager.exposure(line, front, self.dtype)
 
     def __call__(self, heights: Tensor) -> Evaluation:
@@ -178,7 +181,7 @@ class WaveObjective:
         for k, (front, change) in enumerate(zip(self.fronts, self.changes, strict=True)):
             changed = change.of(heights.detach().to(self.middle) - self.middle)
             for line in lines:
-                found = self.imager.exposure(line, front, self.dtype).image(changed)
+                found = self._exposure(line, front).image(changed)
                 image += line.part * self.imager.spread_out(found, k).double()
         return image[a : image.shape[0] - a, a : image.shape[1] - a]
 

@@ -59,7 +59,7 @@ from caustic_cli.schema.table import LensSettings, ScreenSettings, check, defaul
 from caustic_cli.studies.retrace import evaluation_rays, retrace
 
 waves, manufacture = OnDemand("caustic_cli.inverse.wave_objective"), OnDemand("caustic_cli.studies.manufacture")
-by_waves = OnDemand("caustic_cli.studies.waves")
+by_waves, beams = OnDemand("caustic_cli.studies.waves"), OnDemand("caustic_cli.studies.beam")
 
 #: To first order a decentre d changes the irradiance of a Gaussian beam by 4 x d / w^2, of the RMS 2 d / w over the beam.
 CENTRED = (
@@ -520,6 +520,8 @@ class OneSurface(Problem):
         used = next((stage.waves for stage in reversed(self.stages) if stage.waves), ())
         if used and self.one_scene:
             objective = self._refining[1]() if self._refining is not None and self._refining[0] == state.stage else None
+            if (found := self.beam_error(designer, state, objective)) is not None:
+                return found
             approximately = {} if objective is None else {"image_at": cast(Any, objective).image_at}
             lens = self.scene, designer.field(state.stage), state.heights.to(self.device)
             if (error := by_waves.fast_error(*lens, self.target.numpy(), used, **approximately)) is not None:
@@ -530,6 +532,18 @@ class OneSurface(Problem):
         except CausticError:
             return None
         return math.sqrt(math.fsum(row["relative_rms"] ** 2 for row in rows) / len(rows))
+
+    def beam_error(self, designer: Designer, state: State, objective: Any) -> float | None:
+        """Error in the mask of a shaped laser beam, whose other wavelengths tell nothing, by the objective if there is one; None of
+        other light."""
+        scene = self.scene
+        if (how := self.stages[-1].rendering.bright) is None or self.target.ndim > 2 or not scene.screen.upright:
+            return None
+        bright = how.on(self.target)
+        image = None if objective is None else objective.image_at(state.heights, scene.light.wavelengths)
+        if image is None:
+            image = beams.image_at(scene, designer.field(state.stage), state.heights, bright.mask.numpy())
+        return None if image is None else float(bright.error(image.cpu()))
 
     def further_figures(self, designer: Designer, state: State) -> dict[str, Any]:
         """Figures beyond those of any kind."""

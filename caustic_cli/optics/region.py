@@ -6,6 +6,8 @@ Notation
     region      the mask, dilated by a number of pixels
     e           relative error sqrt(mean((I' / T - 1)^2)) over the mask, with I' = I sum T / sum I, sums over the mask
     b           sum of I over the region, over the light that leaves the lens
+    efficiency  b over what it is of the picture itself, sum of T over the region over sum of T: 1 of an image that is the picture,
+                whose own tails may leave the region
 
 as Pasienski and DeMarco (Opt. Express 16, 2176, 2008) judge holograms, whose light outside the region is free.
 """
@@ -29,7 +31,7 @@ BRIGHT = 0.1
 class Region:
     """Which light counts, and how much of it is wanted.
 
-    goal: b, as a fraction; dilated: pixels; given: (n_x, n_y) not negative, of the screen, whose lit pixels are the region,
+    goal: efficiency; dilated: pixels; given: (n_x, n_y) not negative, of the screen, whose lit pixels are the region,
     dilated by nothing.
     """
 
@@ -72,12 +74,20 @@ class Bright:
         rows, columns = (lit.any(k).nonzero()[:, 0] for k in (1, 0))
         return (int(rows[0]), int(rows[-1]) + 1), (int(columns[0]), int(columns[-1]) + 1)
 
+    def ratio(self, image: Tensor) -> Tensor:
+        """I' / T of an image (n_x, n_y) at the pixels of the mask (n,)."""
+        inside, wanted = image[self.mask], self.target[self.mask]
+        return inside / wanted * (wanted.sum() / inside.sum())
+
     def error(self, image: Tensor) -> Tensor:
         """e of an image (n_x, n_y), ()."""
-        inside, wanted = image[self.mask], self.target[self.mask]
-        ratio = inside / wanted * (wanted.sum() / inside.sum())
-        return (ratio - 1.0).square().mean().sqrt()
+        return (self.ratio(image) - 1.0).square().mean().sqrt()
 
-    def efficiency(self, image: Tensor) -> Tensor:
+    def light(self, image: Tensor) -> Tensor:
         """Sum over the region, ()."""
         return image[self.region].sum()
+
+    @property
+    def own(self) -> float:
+        """The part of the picture's light that is in the region."""
+        return float(self.light(self.target) / self.target.sum())

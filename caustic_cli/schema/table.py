@@ -525,7 +525,8 @@ class DesignSettings(Section):
             " the least relative error within the picture at a given fraction of the light (design.efficiency), the rest of which"
             " may lie anywhere", default="rms-light",
             why="eq. 5.2.1 alone is reduced by sending light off the screen", option=Option("--loss"))
-    efficiency: float = setting("log-rms: fraction of the light behind the lens that is to land in the region", "", 0.0, 1.0,
+    efficiency: float = setting("log-rms: fraction of the light behind the lens that is to land in the region, over what the"
+            " picture itself has there: 1 of an image that is the picture", "", 0.0, 1.0,
             above=True, default=0.97, written=False, why="the error falls steeply down to there, and slowly below",
             option=Option("--efficiency", "FRACTION"))
     region: str = setting("log-rms: the region in which light is free to depart from the picture: a number of pixels by which the"

@@ -30,11 +30,13 @@ from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.waves.propagation import (
     TURN,
     Exposure,
+    PrunedExposure,
     cells,
     phase_of,
     pixel_edges,
     power_by_blocks,
     power_on_pixels,
+    pruning_pays,
 )
 from caustic_cli.optics.waves.sampling import Sampling, memory_free
 from caustic_cli.optics.waves.tilted import TiltedExposure, power_on_tilted
@@ -457,6 +459,9 @@ class Imager:
             exposure = self.exposure(line, front, dtype)
             assert isinstance(exposure, Exposure)
             found = exposure.image(torch.zeros_like(exposure.phase)).double()
+        elif pruning_pays(s.padded, s.count, edges := self.edges(line)):
+            phase, amplitude = self.field(line, front, dtype)
+            found = PrunedExposure(phase, amplitude, 0.0, s.padded, edges).image(torch.zeros_like(phase)).double()
         else:
             found = self._by_blocks(line, self.watched(front, line.behind), s.pieces(wide), dtype)
         return self.spread_out(found, mode), front.power

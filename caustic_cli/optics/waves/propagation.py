@@ -158,6 +158,9 @@ Box = tuple[tuple[int, int], tuple[int, int]]
 PRODUCT = 8.0
 #: Gauss points of a pixel: at least so many, and further ones for each Nyquist interval of the field in it.
 POINTS, A_PERIOD = 2, 2.0
+#: Width of pixels that resolve the light, in Nyquist intervals of the field: its square varies twice as fast, so that middles half
+#: an interval apart represent it.
+MIDDLE = 0.55
 
 
 class PrunedExposure(Exposure):
@@ -167,7 +170,7 @@ class PrunedExposure(Exposure):
         U = A_x u A_y^T,    A = exp(-2 pi i j m / N) / sqrt(N),    m = 0, 1, ...
 
     Args:
-        box: the rectangle; all others as of an `Exposure`.
+        box: the rectangle, None for all pixels; middles: see `gauss_points`; all others as of an `Exposure`.
     """
 
     def __init__(
@@ -177,12 +180,14 @@ class PrunedExposure(Exposure):
         factor: float,
         shape: tuple[int, int],
         edges: tuple[Tensor, Tensor],
-        box: Box,
+        box: Box | None = None,
+        middles: bool = False,
     ):
         super().__init__(phase, amplitude, factor, shape, edges)
+        box = box or _all(edges)
         self.box, self.kernels, self.weights, self.pixels = box, [], [], []
         for count, size, edge, ends in zip(phase.shape, shape, edges, box, strict=True):
-            at, weight = gauss_points(edge.to(phase.device), ends, count / size)
+            at, weight = gauss_points(edge.to(phase.device), ends, count / size, middles)
             m = torch.arange(count, dtype=torch.float64, device=phase.device)
             turn = torch.remainder(at.reshape(-1, 1) * m / size, 1.0)
             self.kernels.append(torch.polar(torch.full_like(turn, size**-0.5), -TURN * turn).to(_complex(phase.dtype)))
@@ -215,21 +220,31 @@ class PrunedExposure(Exposure):
         return (self.kernels[0] @ torch.polar(self.amplitude, self.phase + self.factor * change)) @ self.kernels[1].T
 
 
-def gauss_points(edge: Tensor, ends: tuple[int, int], part: float) -> tuple[Tensor, Tensor]:
+def gauss_points(edge: Tensor, ends: tuple[int, int], part: float, middles: bool = False) -> tuple[Tensor, Tensor]:
     """Gauss points of pixels, between edges (count + 1,) in samples, and their weights, in samples: (pixels, points) each.
 
-    ends: first and last pixels, the latter excluded; part: samples of the field over those of its transform.
+    ends: first and last pixels, the latter excluded; part: samples of the field over those of its transform;
+    middles: of pixels that resolve the light, the middles alone.
     """
     low, high = edge[ends[0] : ends[1]], edge[ends[0] + 1 : ends[1] + 1]
-    points = POINTS + math.ceil(A_PERIOD * part * float((high - low).max()) - 1e-9)
+    width = part * float((high - low).max())
+    points = 1 if middles and width <= MIDDLE else POINTS + math.ceil(A_PERIOD * width - 1e-9)
     t, w = (torch.from_numpy(c).to(edge) for c in np.polynomial.legendre.leggauss(points))
     return 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * t - 0.5, 0.5 * (high - low)[:, None] * w
 
 
-def pruning_pays(shape: tuple[int, int], count: tuple[int, int], edges: tuple[Tensor, Tensor], box: Box) -> bool:
+def _all(edges: tuple[Tensor, Tensor]) -> Box:
+    """The rectangle of all pixels."""
+    rows, columns = ((0, len(edge) - 1) for edge in edges)
+    return rows, columns
+
+
+def pruning_pays(
+    shape: tuple[int, int], count: tuple[int, int], edges: tuple[Tensor, Tensor], box: Box | None = None, middles: bool = False
+) -> bool:
     """Whether a `PrunedExposure` is faster than an `Exposure`."""
-    of_each = zip(edges, box, count, shape, strict=True)
-    a, b = (gauss_points(edge, ends, n / size)[0].numel() for edge, ends, n, size in of_each)
+    of_each = zip(edges, box or _all(edges), count, shape, strict=True)
+    a, b = (gauss_points(edge, ends, n / size, middles)[0].numel() for edge, ends, n, size in of_each)
     (n, m), whole = count, shape[0] * shape[1]
     return a * m * (n + b) < PRODUCT * whole * math.log2(whole)
 

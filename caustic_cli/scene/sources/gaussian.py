@@ -197,12 +197,12 @@ class Gaussian(Source):
         cosine = (1.0 - across * across - along * along) ** 0.5
         axes = _axes(tuple(across * a + along * b + cosine * c for a, b, c in zip(e1, e2, e3, strict=True)))
         p = x - self.aside[0], y - self.aside[1]
-        path = axes[2][0] * p[0] + axes[2][1] * p[1]
-        distance, irradiance, sines = path - self.waist_at, axes[2][2], []
-        for axis, w, z in zip(axes[:2], self.waist, self.rayleigh, strict=True):
-            r, stretch = axis[0] * p[0] + axis[1] * p[1], 1.0 + (distance / z) ** 2
+        path = _along(axes[2], p)
+        distance, sines = path - self.waist_at, []
+        irradiance = self._density(axes, p, distance)
+        for axis, z in zip(axes[:2], self.rayleigh, strict=True):
+            r = _along(axis, p)
             sine = r * distance / (distance * distance + z * z)
-            irradiance = irradiance * math.e ** (-2.0 * r * r / (w * w * stretch)) / stretch**0.5
             path = path + 0.5 * r * sine
             sines.append(sine)
         forward = (1.0 - sines[0] ** 2 - sines[1] ** 2) ** 0.5
@@ -211,7 +211,16 @@ class Gaussian(Source):
 
     def irradiance(self, x, y, pupil: Pupil) -> Any:
         """As of a source: of the whole beam."""
-        return self.beam(x, y, pupil).irradiance
+        axes, p = _axes(self.axis), (x - self.aside[0], y - self.aside[1])
+        return self._density(axes, p, _along(axes[2], p) - self.waist_at)
+
+    def _density(self, axes: tuple, p: tuple, distance: Any) -> Any:
+        """Irradiance of a beam along the last of the axes at points of the pupil's plane, this far behind the waist."""
+        density = axes[2][2]
+        for axis, w, z in zip(axes[:2], self.waist, self.rayleigh, strict=True):
+            r, stretch = _along(axis, p), 1.0 + (distance / z) ** 2
+            density = density * math.e ** (r * r * (-2.0 / (w * w * stretch))) / stretch**0.5
+        return density
 
     def passed(self, pupil: Pupil) -> float:
         """As of a source."""
@@ -221,6 +230,12 @@ class Gaussian(Source):
             r, weights = rx * 0.5 * (at[:, None] + 1.0), weights * 0.5 * (at + 1.0)
             return float(weights @ self.irradiance(r * np.cos(turn), r * np.sin(turn), pupil).mean(1))
         return float(weights @ self.irradiance(rx * at[:, None], ry * at[None, :], pupil) @ weights) / 4.0
+
+
+def _along(axis: tuple, p: tuple) -> Any:
+    """Component of points of a plane along an axis: of a tensor product of points it remains one of their coordinates where the
+    axis is along that, so that an upright beam is a product of two exponentials of lines."""
+    return sum(a * c for a, c in zip(axis[:2], p, strict=True) if np.ndim(a) or a)
 
 
 def _axes(axis: tuple) -> tuple[tuple, tuple, tuple]:
