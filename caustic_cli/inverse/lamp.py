@@ -47,7 +47,8 @@ DEGREE = 3
 #: Points of a grid at which limits of two surfaces hold, weight of their squares, the wall there over that to be kept, and the
 #: greatest radius over that there.
 LIMIT_POINTS, STIFF, SAFE, WITHIN = 8000, 10.0, 1.1, 1.02
-#: Points of the grid at whose cells light must not fold, least area of a cell on the target over that for its light, and weight.
+#: Points of the grid at whose cells light must not fold, least area of a cell over that on the brightest place of the target,
+#: and weight.
 FOLD_POINTS, LEAST_AREA, FOLDED = 18_000, 0.2, 0.02
 #: Radius of the first inner surface, a sphere, over its least one.
 BEGIN = 4.0 / 3.0
@@ -106,7 +107,8 @@ class LampObjective:
         self.weights = self.seen + BLURRED * (1.0 - self.seen)
         self.lit = float((target > 0).sum()) if point else float(((smooth > 0) & (self.seen > 0)).sum())
         self.splat = backend_for("cpu").splat
-        self.limits = SurfaceLimits(lamp, goal, field) if lamp.surfaces == 2 else None
+        brightest = float((target.numpy() / goal.shares((target.shape[0], target.shape[1]))).max())
+        self.limits = SurfaceLimits(lamp, goal, field, brightest) if lamp.surfaces == 2 else None
 
     def _interior(self, lamp: Lamp, target: Tensor) -> Tensor:
         """1 on the pixels of the grown screen without a border of the target."""
@@ -141,8 +143,9 @@ class SurfaceLimits:
     """Limits of two free-form surfaces, at the points of a grid: a wall between them, estimated by the radial distance and the
     slopes, the least radius of the inner one, and the greatest of the outer one; and that their light does not fold."""
 
-    def __init__(self, lamp: Lamp, goal: Goal, field: PolarField):
-        self.lamp, self.grids, self.folds = lamp, PointGrid.of(field, LIMIT_POINTS), Folds(lamp, goal, field)
+    def __init__(self, lamp: Lamp, goal: Goal, field: PolarField, brightest: float = 1.0):
+        self.lamp, self.grids = lamp, PointGrid.of(field, LIMIT_POINTS)
+        self.folds = Folds(lamp, goal, field, brightest)
 
     def lack(self, values: Tensor) -> Tensor:
         """Sum of squares of what lacks, relative to each limit, per point, times STIFF; and `Folds`."""
@@ -164,10 +167,13 @@ class Folds:
     Two surfaces can send all light to the target without folds.  Where it folds, which pays a little at the rim of the light, the
     edges of the folds are bright lines narrower than pixels: the error on pixels half as wide was 0.012 with folds and 0.006
     without (30 x 10 m from 8 m).
+
+    brightest: greatest density of the target over its mean, by which the areas of cells may be smaller.
     """
 
-    def __init__(self, lamp: Lamp, goal: Goal, field: PolarField):
+    def __init__(self, lamp: Lamp, goal: Goal, field: PolarField, brightest: float = 1.0):
         (self.rays,) = PointGrid.of(field, FOLD_POINTS, lamp.chip.centre)
+        self.scale = brightest / math.prod(goal.size)
         self.goal, self.through = goal, partial(through_point, replace(lamp, chip=lamp.chip.centre), field)
         number = torch.full(self.rays.shape, -1)
         number.view(-1)[self.rays.lit] = torch.arange(len(self.rays.lit))
@@ -176,8 +182,8 @@ class Folds:
         self.power = self.rays.power[self.corners].mean(1)
 
     def lack(self, values: Tensor) -> Tensor:
-        """Mean over the power of how far the area of each cell on the target, over that for its light, is below LEAST_AREA; areas
-        of folded cells are negative."""
+        """Mean over the power of how far the area of each cell on the target, over that for its light at the brightest place, is
+        below LEAST_AREA; areas of folded cells are negative."""
         light = self.through(self.rays, values)
         x, y, ahead = land(self.goal, light)
         passed = torch.where(ahead, light.power, torch.zeros_like(x))
@@ -186,7 +192,7 @@ class Folds:
             y[self.corners].unbind(1),
             passed[self.corners],
         )
-        area = 0.5 * ((x2 - x0) * (y3 - y1) - (x3 - x1) * (y2 - y0)) / math.prod(self.goal.size)
+        area = 0.5 * ((x2 - x0) * (y3 - y1) - (x3 - x1) * (y2 - y0)) * self.scale
         lack = (LEAST_AREA - area * passed.sum() / power.mean(1).clamp_min(1e-12)).clamp_min(0.0)
         return FOLDED * (torch.where((power > 0).all(1), self.power, torch.zeros_like(lack)) * (lack * lack / (1.0 + lack))).sum()
 
