@@ -176,6 +176,8 @@ def test_a_beam_is_shaped_on_the_command_line(tmp_path, monkeypatch, capfd):
     assert "--region must be a number of pixels or a picture, got 'two'" in capfd.readouterr().err
     assert cli.run(["design", "square.npy", *beam, "--loss", "log-rms", "--efficiency", "1.2"]) == 2
     assert "--efficiency" in capfd.readouterr().err
+    assert cli.run(["design", "square.npy", *beam, *small, "--loss", "log-rms", "--plan"]) == 2
+    assert "depends on the part of the light" in capfd.readouterr().err
 
 
 def test_error_against_efficiency_and_errors_of_alignment(tmp_path, monkeypatch, capfd):

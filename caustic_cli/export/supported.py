@@ -21,6 +21,10 @@ SHAPE = (
     f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold its shape alone"
 )
 SOURCE = "⟨format⟩ {format} does not support sources of type {scene.source.kind}"
+BEAM = (
+    "⟨format⟩ {format}: its sources have rays without a wavefront, so the beam of a laser, with its waist or its phase, cannot be"
+    f" written; {', '.join(name for name in FORMATS if name not in ('lighttools', 'mitsuba'))} hold the lens alone"
+)
 SCREEN = (
     "⟨format⟩ {format} has a screen at a distance, and this lens' picture is in the far field;"
     f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold the lens alone"
@@ -31,7 +35,7 @@ HELD = ("mirror", "gradient index", "tilted screen", "shifted screen", "far fiel
 #: Beyond what ONE_INDEX and TWO_SIDED say.
 _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     "zemax": {"other elements": ONE_LENS, "far field": SCREEN},
-    "lighttools": {"user-defined source": SOURCE, "far field": SCREEN},
+    "lighttools": {"laser beam": BEAM, "user-defined source": SOURCE, "far field": SCREEN},
     "phase": {
         **dict.fromkeys(
             ("mirror", "gradient index", "other elements", "folded axis", "two sides", "several sources"),
@@ -40,6 +44,7 @@ _UNSUPPORTED: dict[str, Mapping[str, str]] = {
         **dict.fromkeys(("ray file", "curved screen"), "⟨format⟩ phase needs a wave image, which there is none of with {}"),
     },
     "mitsuba": {
+        "laser beam": BEAM,
         "far field": SCREEN,
         **dict.fromkeys(
             [name for name in BEYOND_CLEAR if name not in HELD],
@@ -70,6 +75,7 @@ MOULD = Capability("moulds", {"two sides": ONE_SIDE})
 SCRIPT = Capability(
     "script for LightTools",
     {
+        "laser beam": BEAM,
         "user-defined source": SOURCE,
         "two sides": ONE_SIDE,
         **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),

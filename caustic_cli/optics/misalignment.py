@@ -77,7 +77,10 @@ class Misalignment:
         return x, y, z + scene.lens.z_in
 
     def away(self, scene: Scene) -> tuple[float, float, float]:
-        """Displacement of the screen by the error of its distance, in its frame: along the light, towards +z."""
+        """Displacement of the screen by the error of its distance, in its frame: along the light, towards +z; none of the far
+        field."""
+        if scene.screen.far:
+            return 0.0, 0.0, 0.0
         x, y, z = (math.copysign(self.throw, self.throw * scene.undeviated[2]) * c for c in scene.undeviated)
         return x, y, z
 

@@ -57,7 +57,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     tool_fits if one was given; critical_angle_deg, steepest_incidence_deg inside the lens and internal_reflection_margin_deg;
     sharpness_limit_mm and _pixels, of the source's size; landing_mm_per_mm_throw and landing_mm_per_thousandth_index, root mean
     square over the light, and the errors that displace the light by one pixel, throw_error_of_a_pixel_mm and
-    index_error_of_a_pixel.
+    index_error_of_a_pixel; and screen_unit, of lengths on the screen.
 
     Raises:
         InputError: the tool's radius is not above 0.
@@ -98,6 +98,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         "internal_reflection_margin_deg": critical - incidence,
         "sharpness_limit_mm": blur,
         "sharpness_limit_pixels": blur / pixel,
+        "screen_unit": scene.screen.unit,
         "landing_mm_per_mm_throw": by_throw,
         "landing_mm_per_thousandth_index": 1e-3 * by_index,
         "throw_error_of_a_pixel_mm": pixel / by_throw if by_throw > 0 else None,
@@ -221,7 +222,10 @@ def _moved(scene: Scene, other: Scene, field: HeightField, heights: Tensor, seed
 
 
 def _landings(scene: Scene, field: HeightField, heights: Tensor, seed: int, further: float) -> list[RayState]:
-    system, screen = System.of(scene, field), replace(scene.screen, z=scene.screen.z + further)
+    system, screen = (
+        System.of(scene, field),
+        scene.screen if scene.screen.far else replace(scene.screen, z=scene.screen.z + further),
+    )
     return [Tracer(system, rays).land({EXIT: heights}, screen)[0] for rays in _rays(scene, seed)]
 
 
@@ -248,10 +252,10 @@ def rows(f: dict) -> list[tuple[str, str]]:
     found = [
         ("maximum slope", f"{f['maximum_slope']:.4f} (surely below {f['maximum_slope_bound']:.4f})"),
         ("smallest concave radius", concave),
-        ("sharpness limit", f"{f['sharpness_limit_mm']:.3g} mm, {f['sharpness_limit_pixels']:.3g} pixels"),
+        ("sharpness limit", f"{f['sharpness_limit_mm']:.3g} {f['screen_unit']}, {f['sharpness_limit_pixels']:.3g} pixels"),
         (
             "throw wrong by 1 mm",
-            f"light moves {f['landing_mm_per_mm_throw']:.3g} mm{of_a_pixel('throw_error_of_a_pixel_mm', ' mm')}",
+            f"light moves {f['landing_mm_per_mm_throw']:.3g} {f['screen_unit']}{of_a_pixel('throw_error_of_a_pixel_mm', ' mm')}",
         ),
     ]
     if f["minimum_wall_mm"] is None:
@@ -268,6 +272,6 @@ def rows(f: dict) -> list[tuple[str, str]]:
         ),
         (
             "index wrong by 0.001",
-            f"light moves {f['landing_mm_per_thousandth_index']:.3g} mm{of_a_pixel('index_error_of_a_pixel', '')}",
+            f"light moves {f['landing_mm_per_thousandth_index']:.3g} {f['screen_unit']}{of_a_pixel('index_error_of_a_pixel', '')}",
         ),
     ]

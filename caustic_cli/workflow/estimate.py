@@ -25,6 +25,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from caustic_cli.config.default_stages import transport_cells
+from caustic_cli.config.design import region_of
 from caustic_cli.config.settings import build_source
 from caustic_cli.config.wave_stages import transform_samples
 from caustic_cli.errors import CausticError, InputError
@@ -229,6 +230,11 @@ def problem_of_plan(project: Project) -> OneSurface:
         raise InputError(
             "⟨plan⟩ and ⟨error⟩ know designs of one surface for a plane wave, to which their models were fitted, and this is"
             " another; ⟨+quality⟩ or ⟨+design.time_limit⟩ chooses what to pay for"
+        )
+    if region_of(project.settings.design) is not None:
+        raise InputError(
+            "⟨plan⟩ and ⟨error⟩ do not know ⟨design.loss⟩ log-rms, whose error depends on the part of the light that is asked for:"
+            " convergence ⟨study⟩ light measures it for a design"
         )
     return kind.of(project)
 

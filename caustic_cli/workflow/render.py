@@ -60,7 +60,7 @@ def _check_image(asked: Request) -> None:
 
 def _with_screen_at(lens: Lens, z: float | None) -> Lens:
     """The lens with its screen at z, mm."""
-    return lens if z is None else replace(lens, scene=replace(lens.scene, screen=replace(lens.scene.screen, z=z)))
+    return lens if z is None else replace(lens, scene=replace(lens.scene, screen=replace(lens.scene.screen, z=z, far=False)))
 
 
 def _written(rendering: Rendering, began: float) -> dict:

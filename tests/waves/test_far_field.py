@@ -18,6 +18,7 @@ from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.misalignment import Misalignment
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
@@ -25,6 +26,7 @@ from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.screen import FOCAL
 from caustic_cli.scene.sources.gaussian import Gaussian
+from caustic_cli.studies.manufacture import manufacture
 
 
 def far(size: float, pixels: int, **more) -> Screen:
@@ -169,6 +171,8 @@ def test_on_the_command_line(tmp_path, monkeypatch, capfd):
     assert cli.run(["render", "a.caustic", "--quiet", "--json", "--rays", "50000"]) == 0
     found = json.loads(capfd.readouterr().out)
     assert found["screen_unit"] == "mrad" and found["beam"]["error"] < 0.05 and found["beam"]["in_mask"] > 0.9
+    assert cli.run(["render", "a.caustic", "--quiet", "--json", "--rays", "50000", "--screen-at", "800", "-o", "near.png"]) == 0
+    assert json.loads(capfd.readouterr().out)["screen_unit"] == "mm"
     for far_field in (["--picture-size", "1degx1deg"], ["--screen", "far", "--picture-size", "17.4533"]):
         quick = ["--waves", "off", "--iterations", "1", "--quiet", "--rays", "2000", "--resolution", "24", "--margin", "0"]
         assert cli.run(["design", *beam, *far_field, *quick, "-o", "b.caustic", "--force"]) == 0
@@ -183,6 +187,29 @@ def test_on_the_command_line(tmp_path, monkeypatch, capfd):
     ):
         assert cli.run(["design", *beam, *wrong, "--quiet", "-o", "c.caustic"]) == 2
         assert words in capfd.readouterr().err
+
+
+def test_a_mirror_sends_its_picture_there_too():
+    """By transport and by rays, 100 mrad off the light that falls on it."""
+    x = np.abs(np.linspace(-1, 1, 65)[1:] - 1.0 / 64)
+    edge = np.clip((0.7 - x) / 0.1, 0.0, 1.0)
+    target = np.outer(edge, edge)
+    lens = Lens((8.0, 8.0), control=(60, 60), mirror=True, offset=Offset(0.0, (-400.0, -400.0)))
+    screen = Screen((40.0, 40.0), -FOCAL, (64, 64), shift=(100.0, 0.0), far=True)
+    scene = Scene(PlaneWave(), lens, screen)
+    field = HeightField.of(lens)
+    found = first_surface(scene, target, field, 128)
+    picture = by_rays(scene, field, torch.from_numpy(np.asarray(found.heights)), 1 << 20)
+    error = picture / picture.sum() - target / target.sum()
+    assert np.sqrt((error**2).mean()) * target.size < 0.25 and picture.sum() > 0.9
+
+
+def test_an_error_of_the_throw_changes_nothing():
+    scene, field, heights = bent()
+    found = manufacture(scene, field, heights)
+    assert found["landing_mm_per_mm_throw"] == 0.0 and found["screen_unit"] == "mrad"
+    errors = Misalignment(throw=5.0, screen_tilt=(0.0, 0.1))
+    assert errors.away(scene) == (0.0, 0.0, 0.0)
 
 
 def test_it_has_no_shape():

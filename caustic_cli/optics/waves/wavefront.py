@@ -62,8 +62,8 @@ CROSSES = (
 )
 #: Part of the scale up to which the skew of the map from pupil to intercepts is left to the iterations of ray aiming.
 STRAIGHT = 0.05
-#: Deviation of the local magnification from pupil to intercepts from its mean, relative, from which on the iterations of ray aiming
-#: begin at the survey's rays, with their local magnification.
+#: Deviation of the local magnification from pupil to intercepts from its mean, relative, from which on, behind two free-form sides,
+#: the iterations of ray aiming begin at the survey's rays, with their local magnification.
 UNEVEN = 0.7
 #: Tolerated displacement from the grid at the edges of dark regions, in cells.
 AT_EDGE = 0.05
@@ -279,8 +279,9 @@ def survey(optics: Optics) -> Survey:
     magnification = float((weight * area).sum() / (weight * foot).sum()) ** 0.5
     mostly = tuple(tuple(float(torch.quantile(c[lit], q)) for c in (f.big_x, f.big_y)) for q in (FEW, 1.0 - FEW))
     stretched = [torch.gradient(c.view(grid), spacing=1.0 / (SURVEY - 1), dim=k)[0].view(-1)[lit] for k, c in enumerate((f.x, f.y))]
-    uneven = any(float((g / s - 1.0).abs().max()) > UNEVEN for g, s in zip(stretched, scale, strict=True))
-    places = tuple(c[lit] for c in (u, v, f.x, f.y)) if uneven and not any(skew) else None
+    reshapes = sum(not e.surface.flat for e in optics.system.elements) > 1 and not any(skew)
+    uneven = reshapes and any(float((g / s - 1.0).abs().max()) > UNEVEN for g, s in zip(stretched, scale, strict=True))
+    places = tuple(c[lit] for c in (u, v, f.x, f.y)) if uneven else None
     return Survey(light, landing, (offset[0], offset[1]), (scale[0], scale[1]), magnification, mostly, (skew[0], skew[1]), places)
 
 
