@@ -327,3 +327,15 @@ def test_a_part_of_the_pixels_by_matrix_products(keep):
     step = 1e-6 * torch.rand_like(change)
     ahead, behind = (float((part.image(change + s) * by_pixel).sum()) for s in (step, -step))
     assert (ahead - behind) / 2.0 == pytest.approx(float((found * step).sum()), rel=1e-6)
+
+
+def test_pixels_of_half_a_nyquist_interval_at_their_middles():
+    """Their power is that of the transform's sample there, and that of all pixels is Parseval's."""
+    torch.manual_seed(0)
+    phase, amplitude = (torch.rand(32, 20, dtype=torch.float64) for _ in range(2))
+    edges = torch.arange(65, dtype=torch.float64), torch.arange(41, dtype=torch.float64)
+    part = PrunedExposure(6.0 * phase, amplitude, 0.0, (64, 40), edges, sparse=True)
+    field = torch.fft.fft2(torch.polar(amplitude, 6.0 * phase), s=(64, 40), norm="ortho")
+    image = part.image(torch.zeros_like(phase))
+    assert torch.allclose(image, field.abs().square(), rtol=1e-9, atol=1e-12)
+    assert float(image.sum()) == pytest.approx(float(amplitude.square().sum()), rel=1e-12)

@@ -158,9 +158,8 @@ Box = tuple[tuple[int, int], tuple[int, int]]
 PRODUCT = 8.0
 #: Gauss points of a pixel: at least so many, and further ones for each Nyquist interval of the field in it.
 POINTS, A_PERIOD = 2, 2.0
-#: Width of pixels that resolve the light, in Nyquist intervals of the field: its square varies twice as fast, so that middles half
-#: an interval apart represent it.
-MIDDLE = 0.55
+#: Nyquist intervals of the field for each point where these are as few as represent the light: its square varies twice as fast.
+HALF = 0.55
 
 
 class PrunedExposure(Exposure):
@@ -170,7 +169,7 @@ class PrunedExposure(Exposure):
         U = A_x u A_y^T,    A = exp(-2 pi i j m / N) / sqrt(N),    m = 0, 1, ...
 
     Args:
-        box: the rectangle, None for all pixels; middles: see `gauss_points`; all others as of an `Exposure`.
+        box: the rectangle, None for all pixels; sparse: see `gauss_points`; all others as of an `Exposure`.
     """
 
     def __init__(
@@ -181,13 +180,13 @@ class PrunedExposure(Exposure):
         shape: tuple[int, int],
         edges: tuple[Tensor, Tensor],
         box: Box | None = None,
-        middles: bool = False,
+        sparse: bool = False,
     ):
         super().__init__(phase, amplitude, factor, shape, edges)
         box = box or _all(edges)
         self.box, self.kernels, self.weights, self.pixels = box, [], [], []
         for count, size, edge, ends in zip(phase.shape, shape, edges, box, strict=True):
-            at, weight = gauss_points(edge.to(phase.device), ends, count / size, middles)
+            at, weight = gauss_points(edge.to(phase.device), ends, count / size, sparse)
             m = torch.arange(count, dtype=torch.float64, device=phase.device)
             turn = torch.remainder(at.reshape(-1, 1) * m / size, 1.0)
             self.kernels.append(torch.polar(torch.full_like(turn, size**-0.5), -TURN * turn).to(_complex(phase.dtype)))
@@ -220,15 +219,15 @@ class PrunedExposure(Exposure):
         return (self.kernels[0] @ torch.polar(self.amplitude, self.phase + self.factor * change)) @ self.kernels[1].T
 
 
-def gauss_points(edge: Tensor, ends: tuple[int, int], part: float, middles: bool = False) -> tuple[Tensor, Tensor]:
+def gauss_points(edge: Tensor, ends: tuple[int, int], part: float, sparse: bool = False) -> tuple[Tensor, Tensor]:
     """Gauss points of pixels, between edges (count + 1,) in samples, and their weights, in samples: (pixels, points) each.
 
     ends: first and last pixels, the latter excluded; part: samples of the field over those of its transform;
-    middles: of pixels that resolve the light, the middles alone.
+    sparse: as few points as represent the light, such as the middle of a pixel of half a Nyquist interval.
     """
     low, high = edge[ends[0] : ends[1]], edge[ends[0] + 1 : ends[1] + 1]
     width = part * float((high - low).max())
-    points = 1 if middles and width <= MIDDLE else POINTS + math.ceil(A_PERIOD * width - 1e-9)
+    points = max(1, math.ceil(width / HALF)) if sparse else POINTS + math.ceil(A_PERIOD * width - 1e-9)
     t, w = (torch.from_numpy(c).to(edge) for c in np.polynomial.legendre.leggauss(points))
     return 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * t - 0.5, 0.5 * (high - low)[:, None] * w
 
@@ -240,11 +239,11 @@ def _all(edges: tuple[Tensor, Tensor]) -> Box:
 
 
 def pruning_pays(
-    shape: tuple[int, int], count: tuple[int, int], edges: tuple[Tensor, Tensor], box: Box | None = None, middles: bool = False
+    shape: tuple[int, int], count: tuple[int, int], edges: tuple[Tensor, Tensor], box: Box | None = None, sparse: bool = False
 ) -> bool:
     """Whether a `PrunedExposure` is faster than an `Exposure`."""
     of_each = zip(edges, box or _all(edges), count, shape, strict=True)
-    a, b = (gauss_points(edge, ends, n / size, middles)[0].numel() for edge, ends, n, size in of_each)
+    a, b = (gauss_points(edge, ends, n / size, sparse)[0].numel() for edge, ends, n, size in of_each)
     (n, m), whole = count, shape[0] * shape[1]
     return a * m * (n + b) < PRODUCT * whole * math.log2(whole)
 
