@@ -52,6 +52,7 @@ SLOW = (
     "test_lamp_cli.py",
     "test_light.py",
     "test_manufacture.py",
+    "test_photograph.py",
     "test_measured.py",
     "test_movie.py",
     "test_others.py",
@@ -96,6 +97,7 @@ LONG = (
     "test_a_designed_lens_obeys_its_limits",
     "test_files_of_one_index_have_that_of_the_one_wavelength",
     "test_an_addition_touches_few_files",
+    "test_no_correction_makes_a_part_worse",
 )
 
 

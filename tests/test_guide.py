@@ -46,7 +46,7 @@ NEEDS_MORE += ("--tolerances", "--robust", "--day", "blank.caustic")
 #: Networks, which `test_over_range.py` trains smaller.
 NEEDS_MORE += ("zoom.caustic", "--networks")
 #: What takes longest, and is tested by itself: limits, movies, programs for a mill.
-NEEDS_MORE += ("--min-radius 2", "--movie", "--roughing", "portrait.nc", "--tolerance 0.01", "--rays 1e7")
+NEEDS_MORE += ("--photo", "--correct", "--min-radius 2", "--movie", "--roughing", "portrait.nc", "--tolerance 0.01", "--rays 1e7")
 
 
 def blocks(path: Path, language: str) -> list[str]:

@@ -110,7 +110,7 @@ def test_the_angles_of_a_file_are_those_of_the_map():
     plane, gamma = 5.0 * np.arange(72), np.arange(181.0)
     cone = Photometry(plane, gamma, np.broadcast_to(1.0 * (gamma <= 40.0), (72, 181)))
     for name in anglemap.MAPS:
-        assert angles_of(cone, name) == pytest.approx((80.0, 80.0), abs=0.5)
+        assert angles_of(cone, name) == pytest.approx((82.0, 82.0), abs=0.5)  # up to a step beyond the last lit angle
 
 
 # A road

@@ -9,6 +9,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.io.files import destination, refuse_foreign
 from caustic_cli.optics.plan import parse_effects
 from caustic_cli.project.archived import origin_of
+from caustic_cli.project.correction import CORRECTIONS
 from caustic_cli.project.project import Project
 from caustic_cli.project.uptodate import Outputs
 from caustic_cli.workflow.lens import Lens
@@ -41,6 +42,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
             f"{place.image}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it"
         )
         return figures
+    if project is not None and (project.path / CORRECTIONS).exists():
+        say.say(f"{project.path}: is corrected for the errors of a part, without which its image is not the picture")
     lens = _with_screen_at(Lens.of(origin, asked.tracing.given), asked.tracing.screen_at)
     rendering = Rendering(asked, place, lens, device, say)
     figures = _written(rendering, began)

@@ -9,9 +9,12 @@ import io
 
 import numpy as np
 from PIL import Image
-from scipy.interpolate import BSpline, LinearNDInterpolator, RectBivariateSpline
+from scipy.interpolate import BSpline, CloughTocher2DInterpolator, LinearNDInterpolator, RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csc_matrix, hstack
+
+#: Points along each side of a pixel by which marks are drawn.
+FINER = 3
 
 
 def form_error(half, rms, length, seed, points=257):
@@ -124,8 +127,10 @@ def photographed(
     if marks is not None:
         centres, radius = marks
         X, Y = _inverse(project, size)
-        dark = (np.hypot(X[..., None] - centres[:, 0], Y[..., None] - centres[:, 1]) < radius).any(-1)
-        dark = dark.reshape(h, 3, w, 3).mean((1, 3))
+        dark = np.zeros(X.shape)
+        for x0, y0 in centres:
+            dark[np.square(X - x0) + np.square(Y - y0) < radius**2] = 1.0
+        dark = dark.reshape(h, FINER, w, FINER).mean((1, 3))
         radiance = radiance * (1.0 - 0.95 * dark)
     rng = np.random.default_rng(seed)
     light = gaussian_filter(radiance, blur)
@@ -137,19 +142,15 @@ def photographed(
 
 
 def _inverse(project, size):
-    """(X, Y) of points three times finer than the pixels, by Newton's method."""
+    """(X, Y) of points FINER times finer than the pixels, by interpolation of the inverse of a net that is imaged."""
     w, h = size
-    a, b = np.meshgrid((np.arange(3 * w) + 0.5) / 3 - 0.5, (np.arange(3 * h) + 0.5) / 3 - 0.5)
-    X, Y, e = np.zeros_like(a), np.zeros_like(a), 1e-5
-    for _ in range(8):
-        u, v = project(X, Y)
-        (ux, vx), (uy, vy) = project(X + e, Y), project(X, Y + e)
-        j = np.array([[ux - u, uy - u], [vx - v, vy - v]]) / e
-        det = j[0, 0] * j[1, 1] - j[0, 1] * j[1, 0]
-        ru, rv = a - u, b - v
-        X = np.clip(X + (j[1, 1] * ru - j[0, 1] * rv) / det, -4, 4)
-        Y = np.clip(Y + (j[0, 0] * rv - j[1, 0] * ru) / det, -4, 4)
-    return X, Y
+    X, Y = np.meshgrid(np.linspace(-2.2, 2.2, 121), np.linspace(-2.2, 2.2, 121))
+    places = np.stack([c.ravel() for c in project(X, Y)], 1)
+    inverse = CloughTocher2DInterpolator(places, np.stack([X.ravel(), Y.ravel()], 1), fill_value=9.0)
+    a, b = np.linspace(-1, w, 150), np.linspace(-1, h, 150)
+    coarse = inverse(*np.meshgrid(a, b, indexing="ij"))
+    fine = [(np.arange(FINER * n) + 0.5) / FINER - 0.5 for n in (w, h)]
+    return tuple(RectBivariateSpline(a, b, coarse[..., k])(*fine).T for k in (0, 1))
 
 
 def relative_rms(image, target):

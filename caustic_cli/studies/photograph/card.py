@@ -28,6 +28,8 @@ BESIDE = -0.75
 EDGE, INCH, PIXELS = 1.25, 25.4, 2000.0
 #: Darkness of a mark relative to its surroundings, most candidates, and largest miss of a mark, in radii.
 DARK, MOST, MISS = 0.55, 200, 0.6
+#: Marks that may be missing, that beside the corner excepted.
+MISSING = 3
 #: The orientations of a rectangle's corners: as they are, turned, and mirrored.
 TURNS = [[(k + d * i) % 4 for i in range(4)] for d in (1, -1) for k in range(4)]
 
@@ -47,23 +49,16 @@ def find_marks(photograph: np.ndarray) -> Camera:
     """
     dots = _dots(photograph)
     size = (photograph.shape[1], photograph.shape[0])
-    best: tuple[int, Camera] | None = None
+    known, least = marks_of_card(), len(marks_of_card()) - MISSING
     if 4 <= len(dots) <= MOST:
         places, radii = dots[:, :2], dots[:, 2]
-        try:
-            hull = ConvexHull(places).vertices
-        except QhullError:
-            hull = np.array([], dtype=int)
-        known = marks_of_card()
-        for corners in _quadrilaterals(places, hull):
+        for corners in _quadrilaterals(places):
             for turn in TURNS:
                 camera = fit_camera(known[:4], places[[corners[i] for i in turn]], size, "marks")
                 matched = _matched(camera, known, places, radii)
-                if best is None or len(matched) > best[0]:
-                    best = len(matched), _refitted(matched, known, places, radii, size)
-    if best is None or best[0] < len(marks_of_card()) - 3:
-        raise InputError("shows no marks of the test card")
-    return best[1]
+                if len(matched) >= least and matched[-1][0] == len(known) - 1:
+                    return _refitted(matched, known, places, radii, size)
+    raise InputError("shows no marks of the test card")
 
 
 def _refitted(matched: list, known: np.ndarray, places: np.ndarray, radii: np.ndarray, size: tuple[int, int]) -> Camera:
@@ -86,9 +81,11 @@ def _matched(camera: Camera, known: np.ndarray, places: np.ndarray, radii: np.nd
     return [(i, int(j)) for i, j in enumerate(far.argmin(1)) if far[i, j] <= MISS * radii[j]]
 
 
-def _quadrilaterals(places: np.ndarray, hull: np.ndarray) -> list[tuple[int, ...]]:
+def _quadrilaterals(places: np.ndarray) -> list[tuple[int, ...]]:
     """Candidates for the four corners, in the order of the circumference: the largest quadrilaterals of hull vertices."""
-    if len(hull) < 4:
+    try:
+        hull = ConvexHull(places).vertices
+    except QhullError:  # all on a line
         return []
     hull = hull if len(hull) <= 16 else hull[:: -(-len(hull) // 16)]
 

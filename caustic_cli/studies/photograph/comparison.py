@@ -12,11 +12,10 @@ from scipy.optimize import least_squares
 
 from caustic_cli.io.files import SOFTWARE, atomic_file
 from caustic_cli.io.picture import to_linear
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.photograph.camera import displacements
 from caustic_cli.studies.photograph.inference import Inference
-from caustic_cli.studies.photograph.model import cosines
+from caustic_cli.studies.photograph.model import cosines, heights_at
 from caustic_cli.studies.photograph.registration import Photograph
 
 #: Points along each side of surface files, borders included.
@@ -86,29 +85,16 @@ def registered(image: np.ndarray, aim: np.ndarray) -> np.ndarray:
     return moved(best.x)
 
 
-def surfaces(found: Inference) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The part as made, its deviation with the error of the relief's scale, and the standard deviation of that, (POINTS, POINTS)
-    mm over the aperture, [i, j]."""
+def surfaces(found: Inference) -> tuple[np.ndarray, np.ndarray]:
+    """The part as made, and its deviation with that by the relief's scale, (POINTS, POINTS) mm over the aperture, [i, j]."""
     u = np.linspace(0.0, 1.0, POINTS)
     model, guess = found.model, found.guess
     c = cosines(u, len(guess.modes))
     (rx, ry), at = model.field.half_size, (2.0 * u - 1.0)
-    heights = _values(model.field, model.heights, at * rx, at * ry)
+    heights = heights_at(model.field, model.heights, at * rx, at * ry)
     relief = heights - float(model.heights.mean())
     off = c @ guess.modes @ c.T + guess.scale * relief
-    part = found.covariance[14:, 14:].reshape(*guess.modes.shape, *guess.modes.shape)
-    coarse = c[::8]
-    left = np.einsum("xk,yl,klmn,xm,yn->xy", coarse, coarse, part, coarse, coarse, optimize=True)
-    return heights + off, off, np.sqrt(np.clip(left, 0.0, None))
-
-
-def _values(field: HeightField, heights, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Heights on the grid of x and y, mm."""
-    (su, sv), (rx, ry) = field.spaces, field.half_size
-    from torch import from_numpy  # noqa: PLC0415
-
-    bu, bv = (s.matrix(from_numpy(0.5 * (c / r + 1.0)).clamp(0.0, 1.0)) for s, c, r in ((su, x, rx), (sv, y, ry)))
-    return (bu @ heights @ bv.T).numpy()
+    return heights + off, off
 
 
 def write_plot(path: Path, seen: Comparison, target: np.ndarray, found: Inference, encoding: str) -> None:
@@ -133,12 +119,12 @@ def write_plot(path: Path, seen: Comparison, target: np.ndarray, found: Inferenc
     figure.colorbar(shown, ax=axes[0, 2], label="photograph - picture (means)")
     ax, ay = found.model.field.half_size
     part = {"origin": "lower", "extent": (-ax, ax, -ay, ay)}
-    _, deviation, left = surfaces(found)
+    _, deviation = surfaces(found)
     deviation = 1e3 * (deviation - deviation.mean())
     most = float(np.abs(deviation).max()) or 1.0
     for axis, image, low, title in (
         (axes[1, 0], deviation, -most, f"deviation of the part: RMS {deviation.std():.2f} µm"),
-        (axes[1, 1], 1e3 * left, 0.0, "its standard deviation"),
+        (axes[1, 1], 1e3 * found.spread, 0.0, "its standard deviation"),
     ):
         shown = axis.imshow(image.T, cmap="RdBu" if low else "viridis", vmin=low, vmax=most if low else None, **part)
         axis.set_title(title, loc="left")

@@ -6,7 +6,8 @@ Notation
     a_kl        prior standard deviation of the amplitude of mode (k, l) of the deviation, mm: A (1 + (k^2 + l^2) / q^2)^(-p / 2),
                 a Sobolev prior; piston has none
     J           derivatives of the codes by all unknowns, with modes counted in units of a_kl
-    C           covariance of all unknowns, (J^T J / sigma^2 + P)^-1, with P the inverse of the prior covariance
+    C           covariance of all unknowns, (J^T J / sigma^2 + P)^-1, with P the inverse of the prior covariance; or that by
+                clustered misses, if it is larger
 
 A, p and q are those of the largest evidence (MacKay, Bayesian interpolation, Neural Computation 4, 1992), with all other unknowns
 integrated over.  The response of the camera is fitted alone before every level; jointly with the rest it follows too slowly.
@@ -25,7 +26,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 from scipy.ndimage import gaussian_filter
 
-from caustic_cli.studies.photograph.model import Grid, Guess, PartModel, Prediction, Response, Window, cosines
+from caustic_cli.studies.photograph.model import Grid, Guess, PartModel, Prediction, Response, Window, cosines, heights_at
 
 #: Pixels along the longer side, modes along each axis, blur in pixels and most steps of the levels; modes are capped by the last.
 LEVELS = ((32, 6, 1.0, 4), (64, 12, 1.0, 4), (128, 20, 0.7, 4))
@@ -44,6 +45,8 @@ FIRST = (3e-3, 3.0, 2.0)
 ROUNDING = 1.0 / 255.0 / np.sqrt(12.0)
 #: Most pixels over which misses count as correlated while the part is fitted: before, they are correlated widely.
 FEW = 9.0
+#: Pixels along each side of the blocks over which misses are summed for the covariance.
+BLOCK = 8
 #: Halvings of a step that does not help, and relative change of the objective at which a level ends.
 HALVINGS, ENOUGH = 4, 1e-3
 
@@ -115,23 +118,31 @@ class Inference:
 
     @cached_property
     def _values(self) -> np.ndarray:
-        """Values of the modes at points of the aperture, less their means, (SAMPLES^2, modes)."""
-        c = cosines(np.linspace(0.0, 1.0, SAMPLES), len(self.guess.modes))
-        values = np.einsum("xk,yl->xykl", c, c).reshape(SAMPLES**2, -1)
+        """The relief and the modes at points of the aperture, less their means, (SAMPLES^2, 1 + modes)."""
+        at, field = np.linspace(0.0, 1.0, SAMPLES), self.model.field
+        c = cosines(at, len(self.guess.modes))
+        x, y = ((2.0 * at - 1.0) * r for r in field.half_size)
+        relief = heights_at(field, self.model.heights, x, y).reshape(-1, 1)
+        values = np.concatenate([relief, np.einsum("xk,yl->xykl", c, c).reshape(SAMPLES**2, -1)], 1)
         return values - values.mean(0)
 
     def rms(self) -> tuple[float, float]:
-        """RMS of the deviation over the aperture's rectangle about its mean, mm, and its standard deviation."""
-        d = self._values @ self.guess.modes.ravel()
+        """RMS over the aperture's rectangle of the deviation, that by the relief's scale included, about its mean, mm, and its
+        standard deviation."""
+        d = self._values @ np.append(self.guess.scale, self.guess.modes)
         size = float(np.sqrt((d * d).mean()))
         by_mode = self._values.T @ d / (len(d) * max(size, 1e-12))
-        return size, float(np.sqrt(by_mode @ self.covariance[14:, 14:] @ by_mode))
+        return size, float(np.sqrt(by_mode @ self.covariance[13:, 13:] @ by_mode))
+
+    @cached_property
+    def spread(self) -> np.ndarray:
+        """Standard deviation of that deviation at points of the aperture, (SAMPLES, SAMPLES) mm."""
+        variance = np.einsum("pi,pi->p", self._values @ self.covariance[13:, 13:], self._values)
+        return np.sqrt(np.clip(variance, 0.0, None)).reshape(SAMPLES, SAMPLES)
 
     def uncertainty(self) -> float:
         """RMS over the aperture of the standard deviation of the deviation, mm."""
-        return float(
-            np.sqrt(np.einsum("pi,ij,pj->", self._values, self.covariance[14:, 14:], self._values, optimize=True) / SAMPLES**2)
-        )
+        return float(np.sqrt(np.square(self.spread).mean()))
 
 
 def infer(
@@ -297,14 +308,17 @@ class _Fit:
             return guess, prior, True
         return better.guess, prior, before - self._cost(better, prior) < ENOUGH * before
 
+    def _derivatives(self, prediction: Prediction) -> np.ndarray:
+        """Derivatives of the codes by all unknowns, (unknowns, n, m), 0 where the photograph is not known."""
+        J = np.concatenate([prediction.by_response(), *prediction.by_shape()]) * self.known
+        if not self.free:
+            J[13:] = 0.0
+        return J
+
     def _normal(self, prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
         """J^T J / sigma^2 by response, c, s and modes in mm, and J^T (r + J x) / sigma^2 with x their values, those of the response
         relative to the guess."""
-        parts = [prediction.by_response(), *prediction.by_shape()]
-        J = np.concatenate(parts)[:, self.known]  # (unknowns, N)
-        if not self.free:
-            J[13:] = 0.0
-        guess = prediction.guess
+        J, guess = self._derivatives(prediction)[:, self.known], prediction.guess  # (unknowns, N)
         x = np.concatenate([np.zeros(4), guess.camera, [guess.scale], guess.modes.ravel()])
         r = self._misses(prediction)[self.known] + x @ J
         return J @ J.T / self.sigma**2, J @ r / self.sigma**2
@@ -349,13 +363,27 @@ class _Fit:
                 best, most = tried, evidence
         return best
 
+    def _clustered(self, prediction: Prediction, covariance: np.ndarray, unit: np.ndarray) -> np.ndarray:
+        """The covariance in units of the prior by misses where they are, summed over BLOCKs of pixels, not by a common variance:
+        errors of the model gather where the derivatives are large (White, Econometrica 48, 817, 1980; Liang and Zeger, Biometrika
+        73, 13, 1986)."""
+        scores = self._derivatives(prediction) * self._misses(prediction) / self.sigma**2
+        n, m = (size // BLOCK * BLOCK for size in self.grid.shape)
+        blocks = scores[:, :n, :m].reshape(len(unit), n // BLOCK, BLOCK, m // BLOCK, BLOCK).sum((2, 4)).reshape(len(unit), -1)
+        blocks = blocks * unit[:, None]
+        middle = blocks @ blocks.T
+        middle[14:, 14:][np.diag_indices(len(unit) - 14)] += 1.0
+        middle[:14, :14] += self._before(prediction.guess)[0]
+        return covariance @ middle @ covariance
+
     def result(self, guess: Guess, prior: Sobolev) -> Inference:
         """The inference at a guess."""
         prediction = Prediction.of(self.model, self.grid, guess)
         self._estimate(prediction, final=True)
         normal, pull = self._normal(prediction)
         _, _, (factor, unit) = self._solve(guess, normal, pull, prior)
-        covariance = cho_solve(factor, np.eye(len(unit))) * np.outer(unit, unit)
+        covariance = cho_solve(factor, np.eye(len(unit)))
+        covariance = max(covariance, self._clustered(prediction, covariance, unit), key=np.trace) * np.outer(unit, unit)
         misses, seen = self._misses(prediction)[self.known], self.seen[self.known]
         return Inference(
             self.model,

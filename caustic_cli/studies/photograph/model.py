@@ -119,6 +119,13 @@ def deviation(field: HeightField, modes: np.ndarray) -> Tensor:
     return field.interpolated(torch.from_numpy(x @ modes @ y.T))
 
 
+def heights_at(field: HeightField, heights: Tensor, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Heights on the grid of x (a,) and y (b,), (a, b) mm."""
+    at = [torch.from_numpy(0.5 * (c / r + 1.0)).clamp(0.0, 1.0) for c, r in zip((x, y), field.half_size, strict=True)]
+    bu, bv = (s.matrix(c) for s, c in zip(field.spaces, at, strict=True))
+    return (bu @ heights @ bv.T).numpy()
+
+
 def scaled(heights: Tensor, scale: float) -> Tensor:
     """Control heights of a relief that is 1 + scale times as high about its mean."""
     middle = heights.mean()

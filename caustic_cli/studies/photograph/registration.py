@@ -21,11 +21,13 @@ ABOUT = 2.2
 LEAST = 64
 #: Codes below which a photograph is dark all over, and least contrast between its bright and its middle parts.
 BLACK, CONTRAST = 0.06, 0.04
-#: Codes from which on a pixel is saturated, and largest fraction of the screen, or half of the picture's light, that may be.
-SATURATED, BLOWN = 0.98, 0.2
+#: Codes from which on a pixel is saturated, and largest fraction of the screen, and of the image's light, where it may be.
+SATURATED, BLOWN = 0.98, 0.25
 #: Pixels along a side of the images that are compared, blurred by so many pixels; the least correlation of a photograph and the
 #: image of its lens, and by how much another orientation may be better.
-COARSE, SMOOTH, LEAST_LIKE, BETTER = 48, 2.0, 0.45, 0.05
+COARSE, SMOOTH, LEAST_LIKE, BETTER = 48, 2.0, 0.45, 0.03
+#: Light over the mean from which on the screen counts as bright.
+BRIGHT = 0.3
 #: Standard deviations of shift, size and shear, keystone and distortion, half widths, where the picture itself says where it is.
 BY_PICTURE = (0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.02, 0.02, 0.02)
 CORNERS = ((-1.0, 1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
@@ -172,35 +174,47 @@ def refuse_unlike(photograph: Photograph, expected: np.ndarray) -> float:
     """
     n, m = expected.shape
     shape = (COARSE, max(8, round(COARSE * m / n))) if m <= n else (max(8, round(COARSE * n / m)), COARSE)
-    seen = photograph.on_screen(shape)
+    seen, light = photograph.on_screen(shape), np.clip(_on(expected, shape), 0.0, None)
     known = np.isfinite(seen)
     if known.mean() < 0.7:
         raise InputError(f"shows only {known.mean():.0%} of the screen; all of it is needed")
-    blown = float((np.nan_to_num(seen) >= SATURATED).mean())
+    full = np.nan_to_num(seen) >= SATURATED
+    blown = max(float(full.mean()), float((light * full).sum() / light.sum()))
     if blown > BLOWN:
-        raise InputError(f"is blown out: {blown:.0%} of the screen are at the camera's maximum; a shorter exposure is needed")
-    seen = np.where(known, seen, np.nanmedian(seen))
-    image = np.clip(zoom(expected, (shape[0] / n, shape[1] / m), order=1), 0.0, None) ** (1.0 / ABOUT)
-    image = gaussian_filter(image, SMOOTH)
-    like = {}
-    for words, turned in SEEN.items():
-        other = gaussian_filter(seen, SMOOTH)
-        other = turned(other)
-        if other.shape != shape:
-            other = zoom(other, (shape[0] / other.shape[0], shape[1] / other.shape[1]), order=1)
-        like[words] = _like(other, image)
-    best = max(like, key=lambda words: like[words])
-    if like[best] >= LEAST_LIKE and like[best] > like[""] + BETTER:
+        raise InputError(f"is blown out: {blown:.0%} of its light is at the camera's maximum; a shorter exposure is needed")
+    like = {words: _likeness(photograph, _on(turned(light), shape)) for words, turned in SEEN.items()}
+    whole, inner = like[""]
+    best = max(like, key=lambda words: like[words][1])
+    if like[best][0] >= LEAST_LIKE and like[best][1] > inner + BETTER:
         raise InputError(
-            f"{best}: it is like the image of the lens (correlation {like[best]:.2f}) only then, as it is {like['']:.2f};"
+            f"{best}: it is like the image of the lens (correlation {like[best][1]:.2f}) only then, as it is {inner:.2f};"
             " a photograph with column 0 at the screen's -x edge and row 0 at its +y edge is needed, or one with the test card"
         )
-    if like[""] < LEAST_LIKE:
+    if whole < LEAST_LIKE:
         raise InputError(
-            f"shows something else: its correlation with the image of the lens, both blurred, is {like['']:.2f}, where at least"
+            f"shows something else: its correlation with the image of the lens, both blurred, is {whole:.2f}, where at least"
             f" {LEAST_LIKE:g} is needed"
         )
-    return like[""]
+    return whole
+
+
+def _on(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """An image on other pixels."""
+    return image if image.shape == shape else zoom(image, [a / b for a, b in zip(shape, image.shape, strict=True)], order=1)
+
+
+def _likeness(photograph: Photograph, light: np.ndarray) -> tuple[float, float]:
+    """Correlation of a photograph with an image of linear light, both blurred, on the screen and where the image is bright; where
+    no marks say where the screen is, the image itself does."""
+    if not photograph.camera.marks:
+        photograph = replace(photograph, camera=by_picture(photograph.codes, light))
+    seen = photograph.on_screen((light.shape[0], light.shape[1]))
+    known = np.isfinite(seen)
+    if not known.any():
+        return 0.0, 0.0
+    seen = gaussian_filter(np.where(known, seen, np.median(seen[known])), SMOOTH)
+    image, bright = gaussian_filter(light ** (1.0 / ABOUT), SMOOTH), gaussian_filter(light, SMOOTH) > BRIGHT * light.mean()
+    return _like(seen, image), _like(seen[bright], image[bright])
 
 
 def _like(a: np.ndarray, b: np.ndarray) -> float:

@@ -51,7 +51,7 @@ class PartPhotograph(Output):
         assert lens.target is not None
         found = judge(lens, self.photo, self.marks, self.screen_corners, rendering.say, self.codes)
         shown, white = found.shown, float(lens.target.max() / lens.target.mean())
-        made, deviation, _ = comparison.surfaces(found.found)
+        made, deviation = comparison.surfaces(found.found)
         image, values, missing, plot, part, off = paths
         write_image(image, shown.irradiance, white, lens.encoding, WIDE)
         write_npy(values, shown.irradiance)
