@@ -42,7 +42,7 @@ SMALL = {
 OF_HEIGHT_FIELDS = [f"CAUSTIC_DESIGN_{name}" for name in ("RESOLUTION", "ITERATIONS", "CONTROL", "LENS_SIZE", "THROW", "WAVES")]
 #: Lines that need what no chapter makes, and studies of minutes, which tests of their own run smaller.
 NEEDS_MORE = ("--verify", "--source-file led.tm25ray", "--study diffraction", "led.caustic --study light", "--explain")
-NEEDS_MORE += ("--tolerances", "--robust", "--day", "blank.caustic")
+NEEDS_MORE += ("--tolerances", "--robust", "--day", "blank.caustic", "flat.npy")
 #: Networks, which `test_over_range.py` trains smaller.
 NEEDS_MORE += ("zoom.caustic", "--networks")
 #: What takes longest, and is tested by itself: limits, movies, programs for a mill.

@@ -126,7 +126,7 @@ def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spr
     if reached(higher, scene.screen.z):
         ways.append(f"⟨+mag⟩ {higher:g} instead of {mag:.2g}")
     in_room = scene.source.oblique and abs(sum(map(mul, scene.undeviated, scene.screen.axes[2]))) < SQUARE
-    if not in_room and abs(throw) / f > 2.0 * (middle - lens.z_in) and reached(mag, nearer):
+    if not in_room and not scene.screen.far and abs(throw) / f > 2.0 * (middle - lens.z_in) and reached(mag, nearer):
         ways.append(f"⟨+throw⟩ {abs(nearer):g} instead of {abs(scene.screen.z):.3g} mm")
     if larger * max(1.0, mag) <= TABLE["lens.size"].high and reached(mag, scene.screen.z, larger):
         ways.append(f"a lens of {larger:g} mm")

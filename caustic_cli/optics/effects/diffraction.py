@@ -24,5 +24,6 @@ class Diffraction(Effect):
             why, fixed = WAVE_IMAGE.unsupported[obstacle], obstacle in NOT_IMPLEMENTED
             return Decision(self.name, False, why, r.widened, WIDENED, fixed=fixed)
         light = f"{r.wavelength:.4g} nm" if r.said else f"{r.wavelength:.4g} nm, as the scene says no wavelength,"
-        why = f"light of {light} blurs over {r.diffraction:.2g} mm, the source over {r.source:.2g} mm, a pixel is {r.pixel:.2g} mm"
+        blur, source, pixel = (f"{width:.2g} {r.unit}" for width in (r.diffraction, r.source, r.pixel))
+        why = f"light of {light} blurs over {blur}, the source over {source}, a pixel is {pixel}"
         return Decision(self.name, r.matters, why, r.widened, WIDENED)
