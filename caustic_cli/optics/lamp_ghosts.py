@@ -186,17 +186,18 @@ def _followed(both: Sides, going: Going, rng: np.random.Generator) -> tuple[list
         on.append(_interact(both, cavity, o + t[:, None] * d, met, False, rng))
         on.append(_from_chip(lamp.chip, cavity.where(~met & lower), book, rng))
         # Through the lens, to the outer surface, to the inner one or to the base
-        here = glass.origin * torch.where(_beyond(both, glass.origin), 1.0 - NUDGE, 1.0 + NUDGE)[:, None]
+        inwards = _beyond(both, glass.origin).double()
+        here = glass.origin * (1.0 + NUDGE * (1.0 - 2.0 * inwards))[:, None]
         d = glass.direction
         outer, reaches = both.to_outer(here, d)
         base = torch.where(d[:, 2] < 0, -here[:, 2] / d[:, 2].clamp_max(-1e-300), torch.full_like(outer, math.inf))
         most = torch.where(reaches, outer, torch.minimum(base, torch.full_like(base, 4.0 * lamp.radius)))
         inner = both.to_inner(here, d, most)
-        inwards = inner < most
-        outwards = reaches & ~inwards
-        book("base", glass.power[~inwards & ~outwards & torch.isfinite(base)])
-        book("unfollowed", glass.power[~inwards & ~outwards & torch.isinf(base)])
-        on.append(_interact(both, glass, here + inner[:, None] * d, inwards, False, rng))
+        back = inner < most
+        outwards = reaches & ~back
+        book("base", glass.power[~back & ~outwards & torch.isfinite(base)])
+        book("unfollowed", glass.power[~back & ~outwards & torch.isinf(base)])
+        on.append(_interact(both, glass, here + inner[:, None] * d, back, False, rng))
         on.append(_interact(both, glass, here + outer[:, None] * d, outwards, True, rng, left))
         going = Going(*(torch.cat(c) for c in zip(*on, strict=True)))
         if not len(going.power):
