@@ -41,7 +41,9 @@ from caustic_cli.workflow.reporter import Reporter
 #: Draws from the posterior, and rays per pixel and least of all for their images.
 DRAWS, EACH, LEAST = 8, 32, 200_000
 #: Least part of a photograph's variance that a fit must explain, and least gain over its standard deviation.
-EXPLAINED, CERTAIN = 0.97, 2.0
+EXPLAINED, CERTAIN = 0.98, 2.0
+#: The former without marks, where the wrong part explains much, too.
+EXPLAINED_ALONE = 0.9995
 PLOT = "correction.png"
 
 
@@ -98,10 +100,11 @@ def refuse_bad_fit(judged: Judged) -> None:
     Raises:
         CausticError: it does not.
     """
-    if (explained := judged.found.explained) < EXPLAINED:
+    marked = judged.photograph.camera.marks > 0
+    if (explained := judged.found.explained) < (least := EXPLAINED if marked else EXPLAINED_ALONE):
         raise CausticError(
-            f"is explained badly by a deviation of the part: {explained:.1%} of its variance, where {EXPLAINED:.0%} are needed;"
-            " nothing is corrected"
+            f"is explained badly by a deviation of the part: {explained:.2%} of its variance, where {least:.2%} are needed"
+            f"{'' if marked else ' without marks'}; nothing is corrected"
         )
 
 

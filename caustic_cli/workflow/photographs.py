@@ -101,14 +101,15 @@ class Judged:
                 "explained": f.explained,
                 "residual_codes": f.residual,
                 "correlated_px": f.correlated,
-                "not_told_apart": not_told_apart(f),
+                "not_told_apart": not_told_apart(f, camera.marks > 0),
                 "rounds_before": 0 if self.before is None else len(self.before.history),
             },
         }
 
 
-def not_told_apart(found: inference.Inference) -> list[str]:
-    """What a photograph does not tell apart, always or by the uncertainty of this fit, in sentences."""
+def not_told_apart(found: inference.Inference, marked: bool) -> list[str]:
+    """What a photograph does not tell apart, always or by the uncertainty of this fit, in sentences; marked: whether
+    marks say where the screen is."""
     words = [
         "piston: a surface that is higher all over gives the same picture",
         "tilt of the surface and tilt of the part where it was mounted: both shift the picture",
@@ -124,8 +125,8 @@ def not_told_apart(found: inference.Inference) -> list[str]:
         words.append("scale of the relief, and curvature of the part or size of the picture on the wall")
     if any(abs(alike[k, c]) > ALIKE for k in quadratics for c in range(6, 10)):
         words.append("curvature and astigmatism of the part, and size and shear of the picture on the wall")
-    if np.any(sigma[4:6] > 0.01):
-        words.append("where the picture should be on the wall: no marks were found, so tilt is not corrected")
+    if not marked:
+        words.append("without marks: tilt, curvature and astigmatism of the part from where and how large the picture should be")
     return words
 
 
@@ -180,14 +181,17 @@ def judge(
     heights, before = known_heights(lens)
     model = PartModel(lens.scene, lens.field, heights, RAYS**2)
     expected = image_of(model, lens.target.shape)
+    if lens.by_waves:
+        say.say("the lens was refined on its wave image, and the photograph is compared with rays: diffraction counts as blur")
     screen = lens.scene.screen
     file = None if marks in (None, "auto") else Path(str(marks))
     seen = registration.register(photo, codes, expected, screen.half_size, screen.shift, marks=file, corners=places)
+    known = inference.Knowledge(seen.camera.covariance)
     with say.progress(None) as show:
         found = inference.infer(
             model,
             seen.on_screen,
-            inference.Knowledge(seen.camera.covariance),
+            known,
             show=lambda done, whole: show("photograph", "inferring the part", done, whole),
         )
     shown = comparison.compare(seen, found, lens.target, expected)

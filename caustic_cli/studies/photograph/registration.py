@@ -176,8 +176,6 @@ def refuse_unlike(photograph: Photograph, expected: np.ndarray) -> float:
     shape = (COARSE, max(8, round(COARSE * m / n))) if m <= n else (max(8, round(COARSE * n / m)), COARSE)
     seen, light = photograph.on_screen(shape), np.clip(_on(expected, shape), 0.0, None)
     known = np.isfinite(seen)
-    if known.mean() < 0.7:
-        raise InputError(f"shows only {known.mean():.0%} of the screen; all of it is needed")
     full = np.nan_to_num(seen) >= SATURATED
     blown = max(float(full.mean()), float((light * full).sum() / light.sum()))
     if blown > BLOWN:
@@ -195,6 +193,8 @@ def refuse_unlike(photograph: Photograph, expected: np.ndarray) -> float:
             f"shows something else: its correlation with the image of the lens, both blurred, is {whole:.2f}, where at least"
             f" {LEAST_LIKE:g} is needed"
         )
+    if known.mean() < 0.7:
+        raise InputError(f"shows only {known.mean():.0%} of the screen; all of it is needed")
     return whole
 
 

@@ -59,8 +59,6 @@ class PartPhotograph(Output):
         comparison.write_plot(plot, shown, lens.target, found.found, lens.encoding)
         write_npy(part, made)
         write_npy(off, deviation)
-        if lens.by_waves:
-            rendering.say.say("this lens was refined on its wave image; the photograph is compared with rays, blurred as it is")
         names = ("image", "values", "missing_image", "plot", "part_file", "deviation_file")
         return {"photo": found.figures | dict(zip(names, map(str, paths), strict=True))}
 
