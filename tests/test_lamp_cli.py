@@ -137,12 +137,9 @@ def test_the_light_lies_as_the_picture_says(flip, capfd):
     assert figures["uniformity"] is None and figures["of_source"] > 0.7
     turned = picture[::-1] if "x" in flip else picture
     turned = turned[:, ::-1] if "y" in flip else turned
-    at = [((np.arange(n) + 0.5) / n * 8).astype(int) for n in np.load("seen.npy").shape]
-    wanted = turned[np.ix_(*at)]
-    fits = [
-        np.corrcoef(t.ravel(), np.load("seen.npy").ravel())[0, 1]
-        for t in (wanted, wanted[::-1], wanted[:, ::-1], turned.T[np.ix_(*at)])
-    ]
+    seen = np.load("seen.npy")
+    at = np.ix_(*(((np.arange(n) + 0.5) / n * 8).astype(int) for n in seen.shape))
+    fits = [np.corrcoef(t[at].ravel(), seen.ravel())[0, 1] for t in (turned, turned[::-1], turned[:, ::-1], turned.T)]
     assert fits[0] > 0.7 and fits[0] > max(fits[1:]) + 0.1
 
 
