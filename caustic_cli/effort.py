@@ -107,8 +107,8 @@ class Effort:
     )
     #: The same for two free-form surfaces, after the first of the stages above with one.
     two_stages: tuple[tuple[int, int, int, float], ...] = (
-        (800, 30_000, 180, 0.3),
-        (6_000, 60_000, 90, 0.03),
+        (800, 30_000, 150, 0.2),
+        (6_000, 60_000, 80, 0.03),
         (24_000, 250_000, 110, 0.015),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.

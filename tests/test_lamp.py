@@ -410,7 +410,7 @@ def test_folded_light_lacks_and_its_lack_is_differentiable():
     assert float(folds.lack(even)) < 1e-12
     values = even.clone()
     values[1] = bumpy(height=0.02)
-    assert float(folds.lack(values)) > 1e-6
+    assert float(folds.lack(values)) > 1e-9
     light = folds.through(folds.rays, values)  # another sign of folds: neighbours along u land in the other order
     x, _, _ = land(goal, light)
     rows = torch.full(folds.rays.shape, math.nan, dtype=torch.float64)
