@@ -105,7 +105,7 @@ BAD = {
     "led": (DESIGN + "--source led", "--intensity lambertian"),
     "degree": (DESIGN + "--degree 99", "--degree"),
     "screen inside the lens": (DESIGN + "--throw 3", "--throw"),
-    "throw inf": (DESIGN + "--throw inf", "--throw"),
+    "throw nan": (DESIGN + "--throw nan", "--throw"),
     "source": (DESIGN + "--source moon", "--source"),
     "control": (DESIGN + "--control 2", "--control"),
     "control 1e9": (DESIGN + "--control 1e9", "--control"),

@@ -378,7 +378,7 @@ def test_another_file_is_another_design(here, capfd):
         ),
         (["--source", "rays", "--source-file", "led.dat", "--cone", "3"], "--cone belongs to --source"),
         (["--source", "rays", "--source-file", "led.dat", "--waves", "on"], "--waves on: a ray file contains no phase"),
-        (["--source", "point", "--source-file", "led.dat"], "--source-file belongs to --source plane, disc or rays"),
+        (["--source", "point", "--source-file", "led.dat"], "--source-file belongs to --source plane, disc, measured or rays"),
     ],
 )
 def test_bad_files_are_one_line(here, capfd, arguments, message):
