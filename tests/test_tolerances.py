@@ -28,6 +28,8 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.light import Light
+from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.room import tilt_of
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.several import Several
@@ -205,6 +207,34 @@ def test_a_profile_moves_with_its_beam(aperture):
     together = Misalignment(source_shift=(0.7, -0.4), lens_shift=(0.7, -0.4))
     assert torch.equal(landed(scene, together).power, before.power)
     assert float((before.power - drawn.power).abs().max()) > 0.3 * float(drawn.power.max())
+
+
+def test_a_wavelength_is_the_index_of_its_glass():
+    scene, field, heights = small()
+    scene = replace(scene, lens=replace(scene.lens, glass="N-BK7"), light=Light(wavelengths=(550.0,)))
+    more = refractive_index("N-BK7", 550.0 * 1.05) - refractive_index("N-BK7", 550.0)
+    rays = rays_of(scene, "sobol", 5_000, 1)
+    (own,), (index,), (before,) = (
+        landing_points(scene, field, heights, rays, e)
+        for e in (Misalignment(wavelength=0.05), Misalignment(index=more), Misalignment())
+    )
+    assert torch.allclose(own.x, index.x, atol=1e-12) and float((own.x - before.x).abs().max()) > 1e-3
+    assert not reason_ignored(scene, "wavelength") and "glass" in reason_ignored(small()[0], "wavelength")
+
+
+@pytest.mark.parametrize("source", [PlaneWave(), Points(((0.0, 0.0, -60.0),)), PlaneWave(tilt=(10.0, 0.0))])
+def test_a_narrower_aperture_cuts_the_edge_off(source):
+    scene, field, heights = small(source)
+    rays = rays_of(scene, "sobol", 60_000, 1)
+    (whole,), (wide,), (narrow,) = (landing_points(scene, field, heights, rays, Misalignment(aperture=a)) for a in (0.0, 0.2, -0.2))
+    assert torch.equal(whole.power, wide.power) and torch.equal(narrow.x, whole.x)
+    cut = whole.power != narrow.power
+    assert float(narrow.power[cut].sum()) == 0.0 and 0.2 < float(whole.power[cut].sum() / whole.power.sum()) < 0.4
+    if source.collimated and not source.oblique:
+        assert float(narrow.power.sum() / whole.power.sum()) == pytest.approx(0.64, abs=0.002)
+    else:  # the light spreads within the lens: what is far from the axis behind it was so before
+        reach = torch.maximum(whole.x.abs(), (whole.y - whole.y.mean()).abs())
+        assert float(reach[cut].min()) > 0.6 * float(reach[~cut].max())
 
 
 def test_the_decentre_of_a_beam_is_in_the_study():

@@ -4,7 +4,8 @@
 
 with w_0 = 1 - WEIGHT and equal weights otherwise.  The draws are a Latin hypercube, independent of that of a tolerance study, in
 antithetic pairs, so that every error has zero mean.  The scene of a draw is the nearest one with an upright screen
-(`Misalignment.upright`): rotations of the picture or the screen, and roughness, are left out.
+(`Misalignment.upright`): rotations of the picture or the screen, roughness and the aperture are
+left out.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from caustic_cli.scene.tolerances import Tolerances, hypercube
 
 #: Antithetic pairs of draws, exponent of the power mean over them, and their total weight.
 PAIRS, POWER, WEIGHT = 2, 2.0, 0.1
+#: Errors that are left out.
+OMITTED = ("roughness", "aperture")
 #: Stream of random numbers of these draws.
 PURPOSE = 2
 
@@ -43,7 +46,7 @@ def robust_objective(
         InputError: none of the errors applies to the scene.
     """
     scene = scene.unfolded
-    parameters = tuple(p for p in tolerances.parameters if p.error != "roughness" and not reason_ignored(scene, p.error))
+    parameters = tuple(p for p in tolerances.parameters if p.error not in OMITTED and not reason_ignored(scene, p.error))
     fits = tolerances.surface and _resolves(field, tolerances.shortest)
     if not (parameters or fits):
         raise InputError("⟨design.robust⟩ names no error that a design can take into account in this scene")

@@ -67,6 +67,9 @@ CENTRED = (
     " whatever the lens"
 )
 DEFAULT_SPANS = 128  # knot spans of the final net; divisible by 2 through the stages
+#: Of one that shapes a laser beam, whose light beside the picture takes the finest structure: with 128 spans the hardest of the
+#: field's targets has 3.8 times the error.
+BEAM_SPANS = 192
 NETWORK_CONTROL = 50  # table D.2
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a thin plate, and its least wall thickness, mm
 
@@ -222,7 +225,8 @@ class OneSurface(Problem):
         if d.trained:
             return [NETWORK_CONTROL] * 2
         fine = cls.exact_start(d) and not d.shaped
-        spans = d.effort.refinement.spans(max(d.resolution)) if fine else DEFAULT_SPANS
+        coarse = BEAM_SPANS if d.shaped else DEFAULT_SPANS
+        spans = d.effort.refinement.spans(max(d.resolution)) if fine else coarse
         return [spans + p for p in d.lens.degree]
 
     @classmethod

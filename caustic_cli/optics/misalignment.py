@@ -33,7 +33,7 @@ from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import CHUNK, Tracer
-from caustic_cli.scene import Scene, Source
+from caustic_cli.scene import Pupil, Scene, Source
 from caustic_cli.scene.screen import Window, passed_by
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.several import Several
@@ -41,7 +41,8 @@ from caustic_cli.scene.sources.several import Several
 
 @dataclass(frozen=True)
 class Misalignment:
-    """One set of errors, see `scene.tolerances.KINDS`; mm and degrees, source_size relative to the size."""
+    """One set of errors, see `scene.tolerances.KINDS`; mm and degrees, source_size, wavelength and aperture relative to
+    themselves."""
 
     index: float = 0.0
     thickness: float = 0.0
@@ -54,6 +55,8 @@ class Misalignment:
     lens_tilt: tuple[float, float] = (0.0, 0.0)
     screen_shift: tuple[float, float] = (0.0, 0.0)
     screen_tilt: tuple[float, float] = (0.0, 0.0)
+    wavelength: float = 0.0
+    aperture: float = 0.0
 
     @classmethod
     def of(cls, values: Mapping[tuple[str, int], float]) -> Misalignment:
@@ -101,15 +104,16 @@ class Misalignment:
         ]
 
     def scene(self, scene: Scene) -> Scene:
-        """The scene with the erroneous index, source position and source size, in the frame of the lens; the direction of light
-        from infinity and the screen are unchanged.
+        """The scene with the erroneous index, wavelength, source position and source size, in the frame of the lens; the direction
+        of light from infinity and the screen are unchanged.
 
         Raises:
             InputError: the scene is invalid with these errors.
         """
         lens = replace(scene.lens, index=scene.lens.index + self.index) if self.index else scene.lens
+        light = replace(scene.light, wavelengths=tuple((1.0 + self.wavelength) * w for w in scene.light.wavelengths))
         try:
-            return replace(scene, lens=lens, source=self._source(scene, scene.source))
+            return replace(scene, lens=lens, light=light, source=self._source(scene, scene.source))
         except InputError as error:
             raise InputError(f"with these errors the scene is invalid: {error}") from error
 
@@ -163,6 +167,18 @@ class Misalignment:
         after, whole = (relative_flux(s.source, s.source.cone_over(s.lens.pupil)) for s in (changed, scene))
         return after / whole
 
+    def stopped(self, pupil: Pupil, state: RayState) -> RayState:
+        """Rays without those beside a narrower aperture."""
+        if not self.aperture < 0:
+            return state
+        state = state.expanded()
+        x, y, z, dx, dy, dz = state.full((*state.origin, *state.direction))
+        t = (pupil.z - z - state.datum) / dz
+        u, v = ((c + t * d) / (r * (1.0 + self.aperture)) for c, d, r in zip((x, y), (dx, dy), pupil.half_size, strict=True))
+        return replace(
+            state, power=torch.where(pupil.aperture.covers(u, v), state.power, torch.zeros_like(state.power)), sample=None
+        )
+
     def directed(self, scene: Scene, source: Source, state: RayState) -> RayState:
         """Rays of light from infinity rotated by the tilts of source and lens; other rays unchanged."""
         if not source.distant or not (any(self.source_tilt) or any(self.lens_tilt)):
@@ -211,7 +227,7 @@ def landing_points(
             for state in of_member(rays, band.member).chunks(CHUNK):
                 if not isinstance(state, RayState):
                     state = RayState.on_axis(state, system.pupil.half_size, system.pupil.z).expanded()
-                state = errors.directed(scene, band.scene.source, state)
+                state = errors.directed(scene, band.scene.source, errors.stopped(system.pupil, state))
                 tracer = Tracer(system, state, torch.float64, requests)
                 forward = math.copysign(1.0, sum(a * b for a, b in zip(system.axis, axes[2], strict=True)))
                 for out in tracer(parameters):
@@ -231,6 +247,8 @@ def reason_ignored(scene: Scene, error: str) -> str:
         return "a source at infinity has no position; source_tilt is its direction"
     if error == "source_tilt" and not source.distant:
         return "the source is at a finite distance; source_shift moves it"
+    if error == "wavelength" and not scene.dispersive:
+        return "no glass (⟨+lens.glass⟩) has an index that depends on it, at a given wavelength"
     if error == "source_size" and not any(one.sized for one in source.members):
         return f"{source.label} has no size"
     return scene.lens.interaction.lacks.get(error, "")

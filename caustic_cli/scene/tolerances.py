@@ -47,6 +47,8 @@ KINDS = {
     "lens_tilt": Kind(ABOUT, "degrees", 10.0, "rotations of the lens about the x and y axes through the centre of its entrance"),
     "screen_shift": Kind(XY, "mm", 1e6, "decentre of the screen"),
     "screen_tilt": Kind(ABOUT, "degrees", 20.0, "rotations of the screen about its own centre"),
+    "wavelength": Kind(("",), "", 0.1, "of the light, as a fraction of itself, by which the index of a glass changes"),
+    "aperture": Kind(("",), "", 0.5, "width of the lit part of the lens, as a fraction; a wider one changes nothing"),
     "roughness": Kind(("",), "", 0.1, "RMS slope, along either axis, of the exit's microfacets in addition to the scene's own"),
 }
 

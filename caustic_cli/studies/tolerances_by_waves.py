@@ -25,7 +25,7 @@ from caustic_cli.studies.tolerances import TrialFigures, Trials, Values
 #: Realisations of the surface errors with a wave image, which the draws use cyclically.
 REALISED = 8
 #: Errors that can be included in the computation of a wave image.
-WAVED = ("index", "thickness", "throw", "source_shift", "source_distance", "source_size")
+WAVED = ("index", "thickness", "throw", "source_shift", "source_distance", "source_size", "wavelength")
 #: Fixed-point iterations of the inverse displacement.
 BACK = 4
 #: Least width, pixels, of the average of displacements.

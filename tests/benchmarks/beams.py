@@ -21,6 +21,7 @@ import argparse
 import json
 import math
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,20 @@ def gerchberg_saxton(target: np.ndarray, phase: torch.Tensor, weighted: bool) ->
     raise AssertionError
 
 
+def by_slmsuite(target: np.ndarray, phase: torch.Tensor) -> np.ndarray:
+    """The same by the weighted algorithm of slmsuite, which has to be installed."""
+    from slmsuite.holography.algorithms import Hologram  # noqa: PLC0415
+
+    low = TRANSFORM // 2 - WIDE // 2
+    wanted = np.zeros((TRANSFORM, TRANSFORM), np.float32)
+    wanted[low : low + WIDE, low : low + WIDE] = np.sqrt(target / target.sum())
+    hologram = Hologram(wanted, amp=beam().numpy().astype(np.float32), phase=phase.numpy().astype(np.float32))
+    hologram.optimize("WGS-Leonardo", maxiter=ITERATIONS, verbose=False)
+    found = torch.polar(beam(), torch.from_numpy(np.asarray(hologram.get_phase())).double())
+    far = torch.fft.fftshift(torch.fft.fft2(found, s=(TRANSFORM, TRANSFORM), norm="ortho"))
+    return far[low : low + WIDE, low : low + WIDE].abs().square().numpy()
+
+
 def lens_of(target: np.ndarray, efficiency: float, region: int, **options) -> Lens:
     """A lens by the command's own defaults for this beam."""
     pixel = WAVELENGTH * THROW / (2 * SIZE)
@@ -210,6 +225,10 @@ def measured(name: str, efficiencies: list[float], region: int, iterative: bool,
         began = time.process_time()
         rows[method] = judge(gerchberg_saxton(target, start, weighted), 1.0) | {"seconds": time.process_time() - began}
         print(f"{name} {method}: {rows[method]}", flush=True)
+    if iterative and find_spec("slmsuite"):
+        began = time.process_time()
+        rows["slmsuite"] = judge(by_slmsuite(target, start), 1.0) | {"seconds": time.process_time() - began}
+        print(f"{name} slmsuite: {rows['slmsuite']}", flush=True)
     for efficiency in efficiencies:
         began, wall = time.process_time(), time.perf_counter()
         lens = lens_of(target, efficiency, region)
