@@ -22,9 +22,10 @@ from caustic_cli.export.part import part_of
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics import finishing
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.workflow.finishing import Part, deviation
+from caustic_cli.workflow.finishing import Part, deviation, said
 from caustic_cli.workflow.lens import load
 from caustic_cli.workflow.machining import cut_surface, form_deviation
+from caustic_cli.workflow.outputs.finish import _words
 
 HALF = (5.0, 4.0)
 LINES = [np.linspace(-r, r, n) for r, n in zip(HALF, (257, 201), strict=True)]
@@ -190,6 +191,14 @@ def test_finishes_are_compared(project, tmp_path, monkeypatch, capfd):
     found = rendered(capfd, f"{project} --finish list -o a.png")["finishes"]
     assert [row["finish"] for row in found] == ["as designed", "polished:1", "coated:20"]
     assert found[0]["error"] <= found[1]["low"] <= found[1]["error"] <= found[1]["high"] < found[2]["error"]
+
+
+def test_an_error_that_is_unknown_is_said():
+    assert said(0.1234) == "0.1234"
+    assert "no wave image" in said(None)
+    row = {"finish": "a", "error": None, "error_by": "waves", "low": 0.2, "high": 0.3, "slope_rms": 0.1, "scattered": 0.5}
+    assert "no wave image" in _words(row) and "scatters 50%" in _words(row)
+    assert _words(row | {"low": None, "high": None}) == "slopes off by RMS 0.1"
 
 
 def test_a_milled_part_is_finished(tmp_path, monkeypatch, capfd):

@@ -82,19 +82,27 @@ def _rough(scene: Scene, slope: float) -> Scene:
 
 def of_design(lens: Lens, say: Reporter) -> dict[str, Any]:
     """What the correction for the finish of a new design is worth, also said: finish, with steps, the error of the finished part,
-    error_by and noise, uncorrected_error, and relief_um, by how much the surface to be made departs from the designed one; empty
-    without a finish."""
+    error_by and noise, weaker_error and stronger_error for the ends of what is known of the steps, uncorrected_error, and
+    relief_um, by how much the surface to be made departs from the designed one; empty without a finish."""
     finish = lens.project.settings.lens.finish if lens.project else ""
     if not finish:
         return {}
     with say.notify_if_slow("tracing the finished part"):
-        found, plain = (judged(Part(lens, finish, corrected=corrected).finished()) for corrected in (True, False))
+        part, plain = Part(lens, finish), judged(Part(lens, finish, corrected=False).finished())
+        found, (weaker, stronger) = judged(part.finished()), part.unsure()
     off = deviation(replace(lens, field=lens.made[0], heights=lens.made[1]), lens)["most_um"]
     say.say(
-        f"finished ({finish}), the corrected part has an error of {found['error']:.4f} by {found['error_by']}, one made as designed"
-        f" {plain['error']:.4f}; the surface to be made, which is exported, is up to {off:.3g} µm off the designed one"
+        f"finished ({finish}), the corrected part has an error of {said(found['error'])} by {found['error_by']}, {said(weaker)} if"
+        f" the steps are weaker than assumed and {said(stronger)} if stronger, by what is not known of them; one made as designed"
+        f" has {said(plain['error'])}; the surface to be made, which is exported, is up to {off:.3g} µm off the designed one"
     )
-    return {"finish": found | {"steps": finish, "uncorrected_error": plain["error"], "relief_um": off}}
+    more = {"weaker_error": weaker, "stronger_error": stronger, "uncorrected_error": plain["error"], "relief_um": off}
+    return {"finish": found | {"steps": finish} | more}
+
+
+def said(error: float | None) -> str:
+    """An error in words; None where light crosses within the lens, so that it has no wave image."""
+    return "unknown (no wave image)" if error is None else f"{error:.4f}"
 
 
 def deviation(lens: Lens, of: Lens) -> dict[str, float]:

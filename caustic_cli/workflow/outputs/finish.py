@@ -72,9 +72,9 @@ class FinishedPart(Output):
             say.table("finishes: error, and that of weaker and stronger steps", [(row["finish"], _words(row)) for row in found])
         if f := figures.get("finish"):
             rows = []
-            if figures["error"] is not None:
-                error = f"{figures['error']:.4f} by {figures['error_by']}; as designed {f['nominal_error']:.4f}"
-                unsure = f"weaker ones {f['weaker_error']:.4f}, stronger ones {f['stronger_error']:.4f}"
+            if f["nominal_error"] is not None:
+                error = f"{finishing.said(figures['error'])} by {figures['error_by']}; as designed {f['nominal_error']:.4f}"
+                unsure = f"weaker ones {finishing.said(f['weaker_error'])}; stronger ones {finishing.said(f['stronger_error'])}"
                 rows += [("relative RMS error", error), ("steps known to a factor", unsure)]
             rough = (
                 f"slopes RMS {f['roughness']:.2g}, scatters {f['scattered']:.0%} of the light"
@@ -92,9 +92,9 @@ class FinishedPart(Output):
 def _words(row: dict[str, Any]) -> str:
     """A row of the ladder."""
     slopes = f"slopes off by RMS {row['slope_rms']:.2g}"
-    if row["error"] is None:
+    if row["error_by"] is None or row.get("low", 0.0) is None:
         return slopes
-    error = f"{row['error']:.4f} by {row['error_by']}"
+    error = f"{finishing.said(row['error'])} by {row['error_by']}"
     if "low" not in row:
         return error
     rough = f", scatters {row['scattered']:.0%} of the light" if row["scattered"] > FEW else ""
