@@ -21,8 +21,10 @@ from caustic_cli.export.milling.gcode import write_gcode
 from caustic_cli.export.part import part_of
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics import finishing
+from caustic_cli.optics.scattering import scattered
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.workflow.finishing import Part, deviation, said
+from caustic_cli.studies.manufacture import wall_and_stock
+from caustic_cli.workflow.finishing import Workpiece, deviation, said
 from caustic_cli.workflow.lens import load
 from caustic_cli.workflow.machining import cut_surface, form_deviation
 from caustic_cli.workflow.outputs.finish import _words
@@ -110,7 +112,7 @@ def test_roughness_is_left_by_paper_and_removed_by_polish_and_coat():
         finishing.roughness(finishing.parse(text)) for text in ("sanded:400", "sanded:400,2000+polished:5", "sanded:400+coated:5")
     )
     assert 0.02 < sanded.slope < 0.1 and sanded.height == pytest.approx(35e-3 / 70)
-    assert sanded.scattered(0.5, 550.0) > 0.99 and polished.scattered(0.5, 550.0) < 1e-3
+    assert scattered(sanded.height, 0.5, 550.0) > 0.99 and scattered(polished.height, 0.5, 550.0) < 1e-3
     assert polished.slope < finishing.SMOOTH < sanded.slope and coated.slope < finishing.SMOOTH
 
 
@@ -165,7 +167,8 @@ def test_a_design_is_corrected_for_its_finish(project, tmp_path, monkeypatch, ca
     """The finished part is nearer to the designed surface than one that was not corrected; the exported surface is the part."""
     monkeypatch.chdir(tmp_path)
     capfd.readouterr()
-    own = rendered(capfd, project)["finish"]
+    figures = rendered(capfd, f"{project} --report")
+    own, report = figures["finish"], figures["report"]
     assert own["steps"] == "polished:10" and own["roughness"] == 0.0
     assert cli.run(shlex.split(f"export {project} --format lighttools --tolerance 0 -o part.npz --quiet")) == 0
     capfd.readouterr()
@@ -180,6 +183,8 @@ def test_a_design_is_corrected_for_its_finish(project, tmp_path, monkeypatch, ca
     made = lens.made
     assert torch.allclose(field.at(heights, x, x, [(0, 0)])[0], made[0].at(made[1], x, x, [(0, 0)])[0], atol=1e-9)
     assert away(*made) > 0.01  # µm
+    heights = {which: wall_and_stock(lens.scene, *s)["stock_height_mm"] for which, s in (("made", made), ("finished", off))}
+    assert report["stock_height_mm"] == pytest.approx(heights["made"], abs=1e-9) != pytest.approx(heights["finished"], abs=1e-9)
     assert own["rms_um"] < 0.3 * away(*off)
     again = rendered(capfd, "part.npz --finish polished:10")["finish"]
     assert again["nominal_error"] is None and again["rms_um"] > own["rms_um"]  # off the part, not off the design
@@ -211,7 +216,7 @@ def test_a_milled_part_is_finished(tmp_path, monkeypatch, capfd):
     milled = rendered(capfd, "lens.npz --finish milled:lens.nc")["finish"]
     assert milled["slope_rms"] == pytest.approx(cut["cut_slope_rms"], rel=0.05)
     lens = load("lens.npz")
-    coated = deviation(Part(lens, "milled:lens.nc+coated:20").finished(), lens)
+    coated = deviation(Workpiece(lens, "milled:lens.nc+coated:20").finished(), lens)
     assert coated["slope_rms"] < 0.1 * milled["slope_rms"]
 
 

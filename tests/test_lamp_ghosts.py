@@ -7,26 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from test_lamp_files import FIELD, ONE, TWO
 
 from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.optics.interface import reflectance, refract
 from caustic_cli.optics.lamp import emissions, through
 from caustic_cli.optics.lamp_ghosts import ENDS, Sides, ghosts, refracted
-from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.studies.lamp import lamp_image
 
-FIELD = PolarField.uniform((12, 9), (3, 4))
-
-
-def bumpy(radius, seed):
-    """Control values of r of a sphere with bumps."""
-    noise = torch.randn(FIELD.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return FIELD.sphere(radius) * (0.05 * noise).exp()
-
-
-ONE, TWO = bumpy(12.0, 0), torch.stack([bumpy(4.0, 1), bumpy(12.0, 0)])
 CASES = {
     "point": (Lamp(), ONE),
     "chip": (Lamp(Chip("rectangle", (1.0, 2.0), reflectance=0.8)), ONE),

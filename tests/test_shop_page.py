@@ -11,7 +11,7 @@ from test_export import make
 
 from caustic_cli import cli
 from caustic_cli.export.lighttools import write_lighttools
-from caustic_cli.optics.finishing import Roughness
+from caustic_cli.optics.scattering import scattered
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.studies import shop_page
 from caustic_cli.studies.manufacture import _landings
@@ -34,8 +34,8 @@ def test_a_bump_of_the_limit_moves_light_by_a_pixel(width):
 
 def test_roughness_at_the_limit_scatters_a_hundredth():
     scene = make()[0]
-    rough = Roughness(1e-6 * shop_page.limits(scene)["roughness_nm"], 0.01)
-    assert rough.scattered(scene.lens.index - 1.0, scene.light.mean) == pytest.approx(shop_page.SCATTERED)
+    sigma = 1e-6 * shop_page.limits(scene)["roughness_nm"]
+    assert scattered(sigma, scene.lens.index - 1.0, scene.light.mean) == pytest.approx(shop_page.SCATTERED)
 
 
 def test_the_page(tmp_path, monkeypatch, capfd):

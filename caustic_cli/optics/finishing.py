@@ -58,7 +58,7 @@ REMOVED, COAT, LAYER, PIXEL = (0.01, 1000.0), (0.1, 200.0), (0.1, 1000.0), (1.0,
 FORMS = "sanded:GRIT[,GRIT...], polished:UM, coated:UM, printed:LAYER,PIXEL[,COAT] (µm) or milled:FILE, joined by +"
 
 
-class Roughness(NamedTuple):
+class ResidualRoughness(NamedTuple):
     """RMS height and correlation length, mm; slopes have a standard deviation of `slope` along an axis."""
 
     height: float = 0.0
@@ -68,10 +68,6 @@ class Roughness(NamedTuple):
     def slope(self) -> float:
         """Of a Gaussian correlation."""
         return math.sqrt(2.0) * self.height / self.length
-
-    def scattered(self, bend: float, wavelength: float) -> float:
-        """Fraction of light of this wavelength, nm, that it scatters; bend: |n - 1| behind the surface, 2 at a mirror."""
-        return -math.expm1(-((2.0 * math.pi * bend * self.height * 1e6 / wavelength) ** 2))
 
 
 @dataclass(frozen=True)
@@ -91,7 +87,7 @@ class Finish:
         """Heights (n, m), mm, on a grid of this spacing, mm, beside the filter."""
         return z
 
-    def left(self, before: Roughness) -> Roughness:
+    def left(self, before: ResidualRoughness) -> ResidualRoughness:
         """The roughness after it."""
         f = np.array(1.0 / (2.0 * math.pi * before.length))
         return before._replace(height=before.height * float(self.transfer(f)))
@@ -107,12 +103,12 @@ class Pad(Finish):
 
     depth: float
     stiffness: float
-    rough: Roughness | None = None
+    rough: ResidualRoughness | None = None
 
     def transfer(self, f: np.ndarray) -> np.ndarray:
         return np.exp(-f * self.depth * self.stiffness)
 
-    def left(self, before: Roughness) -> Roughness:
+    def left(self, before: ResidualRoughness) -> ResidualRoughness:
         return super().left(before) if self.rough is None else self.rough
 
     def by(self, strength: float) -> Finish:
@@ -190,7 +186,7 @@ def _sanded(word: str, values: str) -> list[Finish]:
         grain = GRAINS.get(int(grit)) if grit.isdecimal() else None
         if grain is None:
             raise InputError(f"⟨finish⟩ {word}: a grit must be one of P{', P'.join(map(str, GRAINS))} without P, got {grit!r}")
-        left = Roughness(1e-3 * grain * ROUGH, 1e-3 * grain * CORRELATED)
+        left = ResidualRoughness(1e-3 * grain * ROUGH, 1e-3 * grain * CORRELATED)
         steps.append(Pad(f"sanded:{grit}", depth=1e-3 * grain, stiffness=BLOCK, rough=left))
     return steps
 
@@ -250,7 +246,7 @@ class Relief:
         return Relief(kept + out[beyond[0] : -beyond[0], beyond[1] : -beyond[1]], self.half_size)
 
     def _smooth(self) -> np.ndarray:
-        """Least-squares polynomial of degree KEPT along either axis, by Legendre polynomials."""
+        """Least-squares polynomial of degree KEPT along either axis, by orthonormal ones."""
         bases = [np.linalg.qr(np.vander(np.linspace(-1, 1, n), KEPT + 1))[0] for n in self.z.shape]
         return bases[0] @ (bases[0].T @ self.z @ bases[1]) @ bases[1].T
 
@@ -295,9 +291,9 @@ def finished(steps: tuple[Finish, ...], relief: Relief, like: HeightField) -> tu
     return HeightField.through(relief.z, relief.half_size) if detailed else relief.on(like)
 
 
-def roughness(steps: tuple[Finish, ...]) -> Roughness:
+def roughness(steps: tuple[Finish, ...]) -> ResidualRoughness:
     """What the steps leave of it, on a surface that was smooth."""
-    rough = Roughness()
+    rough = ResidualRoughness()
     for step in steps:
         rough = step.left(rough)
     return rough

@@ -20,7 +20,7 @@ import numpy as np
 _DEGREE = 180.0 / math.pi
 
 
-class Radial(NamedTuple):
+class RadialMap(NamedTuple):
     """A map about the axis: its radius by gamma, gamma by the radius, and the radius' derivative, all in radians; and the widest
     target, a full angle in degrees."""
 
@@ -31,11 +31,11 @@ class Radial(NamedTuple):
 
 
 RADIAL = {
-    "gnomonic": Radial(np.tan, np.arctan, lambda g: 1.0 / np.cos(g) ** 2, 160.0),
-    "stereographic": Radial(
+    "gnomonic": RadialMap(np.tan, np.arctan, lambda g: 1.0 / np.cos(g) ** 2, 160.0),
+    "stereographic": RadialMap(
         lambda g: 2.0 * np.tan(0.5 * g), lambda r: 2.0 * np.arctan(0.5 * r), lambda g: 1.0 / np.cos(0.5 * g) ** 2, 178.0
     ),
-    "polar": Radial(lambda g: g, lambda r: r, np.ones_like, 178.0),
+    "polar": RadialMap(lambda g: g, lambda r: r, np.ones_like, 178.0),
 }
 #: Their names, and widest target, degrees: a lamp emits into z > 0.
 MAPS, WIDEST = ("latitude", *RADIAL), 178.0

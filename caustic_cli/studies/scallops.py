@@ -19,6 +19,8 @@ from __future__ import annotations
 
 import math
 
+from caustic_cli.optics.scattering import deviation_of
+from caustic_cli.optics.scattering import scattered as scattering
 from caustic_cli.scene import Scene
 
 #: Standard deviation of a parabola's heights in parts of its depth: sqrt(4 / 45).
@@ -39,13 +41,12 @@ def scallops(scene: Scene, step: float, radius: float) -> dict:
     pixel = max(screen.pixel)
     wavelength = scene.light.mean
     blur = bend * throw * step / radius
-    phase = 2.0 * math.pi * bend * PARABOLA / (wavelength * 1e-6)  # standard deviation, rad, per mm of depth
     fine = PIXELS * pixel * radius / (bend * throw)
-    shallow = math.sqrt(-math.log1p(-SCATTERED)) / phase
+    shallow = deviation_of(SCATTERED, bend, wavelength) / PARABOLA
     return {
         "blur_mm": blur,
         "blur_pixels": blur / pixel,
-        "scattered": -math.expm1(-((phase * step * step / (8.0 * radius)) ** 2)),
+        "scattered": scattering(PARABOLA * step * step / (8.0 * radius), bend, wavelength),
         "wavelength_nm": wavelength,
         "step_over_of_half_a_pixel_mm": fine,
         "scallop_of_half_a_pixel_mm": fine * fine / (8.0 * radius),

@@ -1,8 +1,8 @@
 """A page for the shop: the part with its blank, what has to be held in a maker's words, its finish, and how its picture is checked.
 
 Light is displaced on the screen by |n - 1| T times an error s of the slope, at throw T, which is to stay below a pixel p: a bump of
-width w (half a period) and height a of a sinusoid has slopes up to pi a / w, so a <= w p / (pi |n - 1| T).  A smooth surface
-scatters less than SCATTERED of the light for an RMS roughness of lambda sqrt(-ln(1 - SCATTERED)) / (2 pi |n - 1|).
+width w (half a period) and height a of a sinusoid has slopes up to pi a / w, so a <= w p / (pi |n - 1| T).  Its roughness
+is to scatter less than SCATTERED of the light (`optics.scattering`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.io.files import SOFTWARE, write_bytes
+from caustic_cli.optics.scattering import deviation_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -64,11 +65,11 @@ def limits(scene: Scene) -> dict[str, Any]:
     """What has to be held, for JSON: slope, by which the light moves by a pixel; bumps_um, heights by widths, mm; roughness_nm."""
     bend, throw = abs(scene.lens.effective_index - 1.0), abs(scene.screen.z - scene.lens.offset.thickness)
     slope = min(scene.screen.pixel) / (bend * throw)
-    bumps = {float(f"{part * max(scene.lens.size):.3g}"): 0.0 for part in BUMPS}
+    widths = [float(f"{part * max(scene.lens.size):.3g}") for part in BUMPS]
     return {
         "slope": slope,
-        "bumps_um": {width: 1e3 * width * slope / math.pi for width in bumps},
-        "roughness_nm": scene.light.mean * math.sqrt(-math.log1p(-SCATTERED)) / (2.0 * math.pi * bend),
+        "bumps_um": {width: 1e3 * width * slope / math.pi for width in widths},
+        "roughness_nm": 1e6 * deviation_of(SCATTERED, bend, scene.light.mean),
     }
 
 
@@ -94,7 +95,7 @@ def write_page(
         part=_table(_part(scene, report)),
         drawing=base64.b64encode(_drawing(field, heights)).decode(),
         held=_table(_held(found, report)),
-        finish=html.escape(_finish(finish, found)),
+        finish=html.escape(_finish(finish)),
         steps="".join(f"<li>{html.escape(Template(step).substitute(words))}</li>" for step in STEPS),
     )
     write_bytes(path, page.encode())
@@ -142,7 +143,7 @@ def _held(found: dict[str, Any], report: dict[str, Any]) -> list[tuple[str, str]
     return rows
 
 
-def _finish(finish: str, found: dict[str, Any]) -> str:
+def _finish(finish: str) -> str:
     if finish:
         return f"The surface in the exported file is corrected for this finish, without which the picture is wrong: {finish}."
     return (

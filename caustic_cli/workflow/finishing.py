@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,6 +12,7 @@ import torch
 
 from caustic_cli.optics import finishing
 from caustic_cli.optics.finishing import Relief
+from caustic_cli.optics.scattering import scattered
 from caustic_cli.scene import Scene
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.machining import cut_surface
@@ -24,7 +26,7 @@ SURVEY = 301
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class Workpiece:
     """A part that is made of a lens and finished.
 
     Args:
@@ -65,7 +67,7 @@ class Part:
     def scattered(self) -> float:
         """Fraction of the light that the roughness scatters; wave images leave it out."""
         scene = self.lens.scene
-        return finishing.roughness(self.steps).scattered(abs(scene.lens.effective_index - 1.0), scene.light.mean)
+        return scattered(finishing.roughness(self.steps).height, abs(scene.lens.effective_index - 1.0), scene.light.mean)
 
     def unsure(self, **how: Any) -> list[float | None]:
         """Errors for weaker and for stronger steps; how: arguments of `judged`."""
@@ -76,8 +78,7 @@ def _rough(scene: Scene, slope: float) -> Scene:
     """With a surface whose facets have these slopes beside their own, if they matter."""
     if slope < finishing.SMOOTH:
         return scene
-    whole = float(torch.tensor([scene.lens.roughness, slope]).norm())
-    return replace(scene, lens=replace(scene.lens, roughness=min(whole, 1.0)))
+    return replace(scene, lens=replace(scene.lens, roughness=min(math.hypot(scene.lens.roughness, slope), 1.0)))
 
 
 def of_design(lens: Lens, say: Reporter) -> dict[str, Any]:
@@ -88,7 +89,7 @@ def of_design(lens: Lens, say: Reporter) -> dict[str, Any]:
     if not finish:
         return {}
     with say.notify_if_slow("tracing the finished part"):
-        part, plain = Part(lens, finish), judged(Part(lens, finish, corrected=False).finished())
+        part, plain = Workpiece(lens, finish), judged(Workpiece(lens, finish, corrected=False).finished())
         found, (weaker, stronger) = judged(part.finished()), part.unsure()
     off = deviation(replace(lens, field=lens.made[0], heights=lens.made[1]), lens)["most_um"]
     say.say(
@@ -132,7 +133,7 @@ def compared(lens: Lens, finishes: tuple[str, ...] | None = None) -> list[Mappin
     scatters."""
     rows: list[Mapping[str, Any]] = [{"finish": "as designed", **judged(lens), "slope_rms": 0.0, "scattered": 0.0}]
     for finish in finishes or LADDER:
-        part = Part(lens, finish)
+        part = Workpiece(lens, finish)
         now = part.finished()
         figures = judged(now)
         errors = sorted(e for e in (figures["error"], *part.unsure()) if e is not None) or [None]

@@ -55,7 +55,7 @@ GHOSTS = "ghosts"
 WHITE = 0.999
 
 
-class Evaluation(NamedTuple):
+class LampEvaluation(NamedTuple):
     """image, wanted: part of the light on each pixel, (n_x, n_y), and as it should be; table: of intensities; figures: of
     `studies.lamp` and of the table."""
 
@@ -109,7 +109,7 @@ class LampDesign:
         """As it is written in a format."""
         return lamp_formats.Exported(self.lamp, self.goal, self.field, self.values, self.name, self.project.seed)
 
-    def evaluated(self, rays: int | None, seed: int) -> Evaluation:
+    def evaluated(self, rays: int | None, seed: int) -> LampEvaluation:
         """The light by independent rays; rays: None for those of the evaluation of a design."""
         effort = current_effort()
         rays = rays or effort.final_rays
@@ -121,7 +121,7 @@ class LampDesign:
         with one_thread():  # the tensors of a chunk of rays are too small for more
             found, figures = lamp_figures(self.lamp, self.goal, self.field, self.values, fine, coarse, **how)
         table = intensities.table()
-        return Evaluation(found.image, fine, table, figures | table.figures)
+        return LampEvaluation(found.image, fine, table, figures | table.figures)
 
     def render(self, rays: float | None = None, *, seed: int | None = None) -> Render:
         """Trace the lamp with independent rays: part of the light on each pixel, and the figures of `caustic render`.
@@ -142,7 +142,7 @@ class LampDesign:
         lamp_formats.write(Path(path), self.exported, name, samples)
         return Path(path)
 
-    def write_report(self, path: Path, found: Evaluation) -> None:
+    def write_report(self, path: Path, found: LampEvaluation) -> None:
         """Write the report of an evaluation."""
         of = (self.lamp, self.goal, self.field, self.values)
         lamp_report.write_lamp_report(path, *of, found.image, found.wanted, found.table, found.figures)

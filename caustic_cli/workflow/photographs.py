@@ -38,6 +38,7 @@ PHOTOGRAPHS = Capability(
             "lenslet array",
             "coloured picture",
             "curved screen",
+            "far field",
             "several sources",
             "ray file",
             "near source",
@@ -54,7 +55,7 @@ class Judged:
 
     photograph: registration.Photograph
     found: inference.Inference
-    shown: comparison.Comparison
+    shown: comparison.ComparedPhotograph
     #: What is known from earlier photographs.
     before: correction.Correction | None
     #: Correlation of the photograph and the image of the lens, blurred.

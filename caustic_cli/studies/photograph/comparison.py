@@ -23,7 +23,7 @@ POINTS = 257
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class ComparedPhotograph:
     """A photograph on the pixels of the screen, (n, m), in units of its mean, and its errors, relative RMS.
 
     as_photographed: of codes taken for sRGB; in_frame: after response and camera were fitted; registered: also moved, stretched and
@@ -41,7 +41,7 @@ class Comparison:
     missing_light: float
 
 
-def compare(photograph: Photograph, found: Inference, target: np.ndarray, image: np.ndarray) -> Comparison:
+def compare(photograph: Photograph, found: Inference, target: np.ndarray, image: np.ndarray) -> ComparedPhotograph:
     """Compare a photograph with the target and the image of the lens as designed, (n, m) each."""
     n, m = target.shape
     codes = photograph.on_screen((n, m))
@@ -54,7 +54,7 @@ def compare(photograph: Photograph, found: Inference, target: np.ndarray, image:
     aim, own = target / target.mean(), image / image.mean()
     onto = registered(light, aim)
     missing = np.clip(aim - onto, 0.0, None)
-    return Comparison(
+    return ComparedPhotograph(
         light,
         onto,
         relative_rms(to_linear(codes), aim),
@@ -97,7 +97,7 @@ def surfaces(found: Inference) -> tuple[np.ndarray, np.ndarray]:
     return heights + off, off
 
 
-def write_plot(path: Path, seen: Comparison, target: np.ndarray, found: Inference, encoding: str) -> None:
+def write_plot(path: Path, seen: ComparedPhotograph, target: np.ndarray, found: Inference, encoding: str) -> None:
     """Write a PNG: target, photograph on the screen, where light is missing; deviation of the part and its uncertainty."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
@@ -115,7 +115,8 @@ def write_plot(path: Path, seen: Comparison, target: np.ndarray, found: Inferenc
     off = seen.registered_irradiance - aim
     most = float(np.percentile(np.abs(off), 99.5)) or 1.0
     shown = axes[0, 2].imshow(off.T, cmap="RdBu", vmin=-most, vmax=most, **place)
-    axes[0, 2].set_title(f"red: {seen.missing_light:.1%} of light is missing; registered: {seen.registered:.3f}", loc="left")
+    missing = f"red: {seen.missing_light:.1%} of light is missing"
+    axes[0, 2].set_title(f"{missing}\nerror once registered: {seen.registered:.3f}", loc="left")
     figure.colorbar(shown, ax=axes[0, 2], label="photograph - picture (means)")
     ax, ay = found.model.field.half_size
     part = {"origin": "lower", "extent": (-ax, ax, -ay, ay)}

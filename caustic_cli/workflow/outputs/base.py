@@ -146,6 +146,11 @@ class Rendering:
     xyz: np.ndarray | None = None
     waves_xyz: np.ndarray | None = None
     figures: dict[str, Any] = field(default_factory=dict)
+    #: As designed, whatever surface is traced instead.
+    designed: Lens = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.designed = self.lens
 
     @property
     def scene(self) -> Scene:

@@ -23,7 +23,7 @@ class FinishedPart(Output):
 
     finish: str | None = None
     tool_radius: float | None = None
-    part: finishing.Part | None = field(default=None, init=False)
+    part: finishing.Workpiece | None = field(default=None, init=False)
     ladder: list[Any] = field(default_factory=list, init=False)
 
     @property
@@ -47,7 +47,7 @@ class FinishedPart(Output):
             with rendering.say.notify_if_slow("tracing the lens as each of the finishes leaves it"):
                 self.ladder = finishing.compared(rendering.lens)
         elif finish:
-            self.part = finishing.Part(rendering.lens, finish, self.tool_radius)
+            self.part = finishing.Workpiece(rendering.lens, finish, self.tool_radius)
             rendering.lens = self.part.finished()
 
     def write(self, rendering: Rendering) -> dict[str, Any]:

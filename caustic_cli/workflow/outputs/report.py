@@ -23,8 +23,8 @@ class ManufacturingReport(Output):
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """report: the figures of `studies.manufacture`."""
-        lens, (path,) = rendering.lens, self.paths(rendering.place)
-        found = manufacture.manufacture(lens.scene, lens.field, lens.heights, self.tool_radius, rendering.seed)
+        lens, (path,) = rendering.designed, self.paths(rendering.place)
+        found = manufacture.manufacture(lens.scene, *lens.made, self.tool_radius, rendering.seed)
         manufacture.write_json(path, found)
         rendering.say.say(f"{path}: manufacturing figures of the lens")
         return {"report": found}

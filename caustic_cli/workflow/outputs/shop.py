@@ -11,6 +11,7 @@ from caustic_cli.scene.traits import Capability
 from caustic_cli.studies import manufacture, shop_page
 from caustic_cli.studies.photograph.card import write_card
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering, single
+from caustic_cli.workflow.outputs.test_card import TestCard
 
 
 @dataclass(eq=False)
@@ -18,7 +19,9 @@ class ShopPage(Output):
     """The page at `shop`; beside it NAME-card.png and NAME-card.csv."""
 
     option: ClassVar[str] = "shop"
-    capability: ClassVar[Capability] = single("page for the shop", "shop")
+    capability: ClassVar[Capability] = Capability(
+        "page for the shop", {**TestCard.capability.unsupported, **single("page for the shop", "shop").unsupported}
+    )
     beyond: ClassVar[bool] = True
 
     shop: Path
@@ -31,13 +34,11 @@ class ShopPage(Output):
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """shop: page and card, and the limits of `studies.shop_page`."""
-        lens, (page, sheet, table) = rendering.lens.origin.read({}), self.paths(rendering.place)
-        surface = rendering.lens.origin.made(lens.field, lens.heights)
-        project = rendering.lens.project
-        report = manufacture.manufacture(lens.scene, *surface, seed=rendering.seed)
+        lens, (page, sheet, table) = rendering.designed, self.paths(rendering.place)
+        report = manufacture.manufacture(lens.scene, *lens.made, seed=rendering.seed)
         card = write_card(sheet, table, lens.scene.screen.half_size, lens.scene.screen.shift)
-        title, finish = rendering.place.lens.resolve().stem, project.settings.lens.finish if project else ""
-        limits = shop_page.write_page(page, title, lens.scene, *surface, report, finish, card)
+        title, finish = rendering.place.lens.resolve().stem, lens.project.settings.lens.finish if lens.project else ""
+        limits = shop_page.write_page(page, title, lens.scene, *lens.made, report, finish, card)
         return {"shop": {"page": str(page), "card": str(sheet)} | limits}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:

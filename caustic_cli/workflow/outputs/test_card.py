@@ -16,7 +16,7 @@ class TestCard(Output):
 
     option: ClassVar[str] = "test_card"
     capability: ClassVar[Capability] = Capability(
-        "test cards", {"curved screen": "⟨test_card⟩ is a plane sheet, and this scene has {}"}
+        "test cards", dict.fromkeys(("curved screen", "far field"), "a test card is a plane sheet, and this scene has {}")
     )
     files: ClassVar[tuple[str, ...]] = ("card.png", "card.csv")
     beyond: ClassVar[bool] = True
