@@ -15,9 +15,11 @@ in x - t_i out of single precision.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -50,6 +52,19 @@ def open_knots(n: int, degree: int, parts: int = 1) -> Tensor:
     times[::spans] = degree
     inner = inner.repeat_interleave(times)
     return torch.cat([inner.new_zeros(1), inner, inner.new_ones(1)])
+
+
+class PiecewiseBasis(NamedTuple):
+    """The basis functions of a space as polynomials of xi = (x - middle) / width in [-1/2, 1/2], on each of I pieces.
+
+    first (I,): the first that does not vanish there; middles, widths (I,); matrices (I, p + 1, p + 1): [i, a, k] is the coefficient
+    of xi^a in basis function first + k.
+    """
+
+    first: Tensor
+    middles: Tensor
+    widths: Tensor
+    matrices: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,29 +149,44 @@ class SplineSpace:
         Returns:
             first (...) int64, values (..., p + 1) float64.
         """
-        x = x.double()
+        first, values = self.bases(x, [derivative])
+        return first, values[derivative]
+
+    def bases(self, x: Tensor, orders: Iterable[int]) -> tuple[Tensor, dict[int, Tensor]]:
+        """`basis` for every order of derivative in `orders`, by one triangular scheme."""
+        x, orders = x.double(), list(orders)
         s = self.span(x)
         p, t = self.degree, self.knots.to(x.device)
-        if derivative > p:
-            return s - p, torch.zeros(*x.shape, p + 1, dtype=torch.float64, device=x.device)
-        low = p - derivative
-        values = [torch.ones_like(x)]  # degree 0 on the span
-        for k in range(1, low + 1):  # raise the degree one at a time
+        near = {k: t[s + k] for k in range(1 - p, p + 1)}
+        of_degree = [[torch.ones_like(x)]]  # values on the span, of degree 0, 1, ...
+        for k in range(1, p - min(orders) + 1):  # raise the degree one at a time
             nxt, saved = [], torch.zeros_like(x)
-            for r in range(k):
-                right, left = t[s + r + 1], t[s + r + 1 - k]
-                term = values[r] / (right - left)  # t_{s+1} > t_s lies inside: never 0
+            for r, value in enumerate(of_degree[-1]):
+                right, left = near[r + 1], near[r + 1 - k]
+                term = value / (right - left)  # t_{s+1} > t_s lies inside: never 0
                 nxt.append(saved + (right - x) * term)
                 saved = (x - left) * term
-            values = [*nxt, saved]
-        for k in range(low + 1, p + 1):  # eq. 2.4.9: N'_{i,k} = k N_{i,k-1} / (t_{i+k} - t_i) - k N_{i+1,k-1} / (...)
-            nxt, saved = [], torch.zeros_like(x)
-            for r in range(k):
-                term = k * values[r] / (t[s + r + 1] - t[s + r + 1 - k])
-                nxt.append(saved - term)
-                saved = term
-            values = [*nxt, saved]
-        return s - p, torch.stack(values, -1)
+            of_degree.append([*nxt, saved])
+        out = {}
+        for order in orders:
+            values = of_degree[p - order] if order <= p else [torch.zeros_like(x)] * (p + 1)
+            for k in range(len(values), p + 1):  # eq. 2.4.9: N'_{i,k} = k N_{i,k-1} / (t_{i+k} - t_i) - k N_{i+1,k-1} / (...)
+                nxt, saved = [], torch.zeros_like(x)
+                for r, value in enumerate(values):
+                    term = k * value / (near[r + 1] - near[r + 1 - k])
+                    nxt.append(saved - term)
+                    saved = term
+                values = [*nxt, saved]
+            out[order] = torch.stack(values, -1)
+        return s - p, out
+
+    @cached_property
+    def pieces(self) -> PiecewiseBasis:
+        """The basis functions as polynomials between breakpoints."""
+        middles, widths = (self.breaks[1:] + self.breaks[:-1]) / 2.0, self.breaks.diff()
+        first, values = self.bases(middles, range(self.degree + 1))
+        rows = [value * (widths**a / math.factorial(a))[:, None] for a, value in values.items()]
+        return PiecewiseBasis(first, middles, widths, torch.stack(rows, 1).contiguous())
 
     def matrix(self, x: Tensor, derivative: int = 0) -> Tensor:
         """Collocation matrix of all n basis functions at the points x (m,): (m, n) float64, dense."""

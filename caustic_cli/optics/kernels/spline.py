@@ -12,12 +12,10 @@ in a global one it is not (degree 7 loses everything in single precision).
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels.jit import FAST, njit
@@ -45,12 +43,9 @@ class Axis:
     """
 
     def __init__(self, space: SplineSpace):
-        breaks = space.breaks
-        middle, width = (breaks[1:] + breaks[:-1]) / 2.0, breaks[1:] - breaks[:-1]
-        self.space, self.first = space, space.basis(middle)[0].numpy()
-        rows = [space.basis(middle, a)[1] * (width**a / math.factorial(a))[:, None] for a in range(space.degree + 1)]
-        self.matrices = torch.stack(rows, 1).contiguous().numpy()
-        self.geometry = (breaks.numpy(), middle.numpy(), (1.0 / width).numpy())
+        first, middles, widths, matrices = space.pieces
+        self.space, self.first, self.matrices = space, first.numpy(), matrices.numpy()
+        self.geometry = (space.breaks.numpy(), middles.numpy(), (1.0 / widths).numpy())
 
 
 @lru_cache(maxsize=16)
