@@ -172,7 +172,8 @@ class PiecewiseSurface:
         """z, mm, z_x and z_y at points (N,) mm within the aperture."""
         (i, xi, by_x), (j, eta, by_y) = (self._place(axis, c) for axis, c in enumerate((x, y)))
         at = i * len(self.middles[1]) + j
-        row, slope = self.rows[-1][at], 0.0  # (N, p + 1)
+        row = self.rows[-1][at]  # (N, p + 1)
+        slope = torch.zeros_like(row)
         for b in reversed(self.rows[:-1]):
             slope = slope * eta[:, None] + row
             row = row * eta[:, None] + b[at]
