@@ -15,11 +15,9 @@ in x - t_i out of single precision.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -52,19 +50,6 @@ def open_knots(n: int, degree: int, parts: int = 1) -> Tensor:
     times[::spans] = degree
     inner = inner.repeat_interleave(times)
     return torch.cat([inner.new_zeros(1), inner, inner.new_ones(1)])
-
-
-class PiecewiseBasis(NamedTuple):
-    """The basis functions of a space as polynomials of xi = (x - middle) / width in [-1/2, 1/2], on each of I pieces.
-
-    first (I,): the first that does not vanish there; middles, widths (I,); matrices (I, p + 1, p + 1): [i, a, k] is the coefficient
-    of xi^a in basis function first + k.
-    """
-
-    first: Tensor
-    middles: Tensor
-    widths: Tensor
-    matrices: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,14 +164,6 @@ class SplineSpace:
                 values = [*nxt, saved]
             out[order] = torch.stack(values, -1)
         return s - p, out
-
-    @cached_property
-    def pieces(self) -> PiecewiseBasis:
-        """The basis functions as polynomials between breakpoints."""
-        middles, widths = (self.breaks[1:] + self.breaks[:-1]) / 2.0, self.breaks.diff()
-        first, values = self.bases(middles, range(self.degree + 1))
-        rows = [value * (widths**a / math.factorial(a))[:, None] for a, value in values.items()]
-        return PiecewiseBasis(first, middles, widths, torch.stack(rows, 1).contiguous())
 
     def matrix(self, x: Tensor, derivative: int = 0) -> Tensor:
         """Collocation matrix of all n basis functions at the points x (m,): (m, n) float64, dense."""

@@ -146,7 +146,7 @@ def reference(
     ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*tensors)
     oz, dz = side * (oz - middle), side * dz
     low_z, high_z = sorted(side * z for z in surface.hull(h))
-    shape, (rx, ry) = surface.function(h, ox.numel()), surface.half_size
+    rx, ry = surface.half_size
     ahead = dz > 0
     dz = torch.where(ahead, dz, torch.ones_like(dz))
     enter, leave = _above_aperture((ox, oy), (dx, dy), surface.half_size)
@@ -156,13 +156,13 @@ def reference(
     low = torch.where(possible, low, torch.zeros_like(low))
     high = torch.where(possible, high, torch.zeros_like(high))
 
-    def f(t: Tensor, of: Tensor) -> tuple[Tensor, Tensor]:
-        if not len(of):
+    def f(t: Tensor, of: Tensor | slice) -> tuple[Tensor, Tensor]:
+        if not len(t):
             return t, t
         x, y = ox[of] + t * dx[of], oy[of] + t * dy[of]
         if rx < torch.inf:
             x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
-        z, zx, zy = shape(x, y)
+        z, zx, zy = surface.at(h, x, y)
         return oz[of] + t * dz[of] - side * z, dz[of] - side * (zx * dx[of] + zy * dy[of])
 
     status = torch.where(possible, int(Status.HIT), int(Status.MISSED))
@@ -191,14 +191,15 @@ def reference(
     for _ in range(MOST_STEPS):
         if not len(of):
             break
-        at = t[of]
-        value, slope_f = f(at, of)
-        a, b = torch.where(value < 0, at, low[of]), torch.where(value >= 0, at, high[of])
+        some = slice(None) if len(of) == len(t) else of  # of all rays nothing has to be looked up
+        at = t[some]
+        value, slope_f = f(at, some)
+        a, b = torch.where(value < 0, at, low[some]), torch.where(value >= 0, at, high[some])
         step = value / slope_f
-        done = ((value.abs() <= close[of]) & (step.abs() <= narrow[of])) | (b - a <= narrow[of])
+        done = ((value.abs() <= close[some]) & (step.abs() <= narrow[some])) | (b - a <= narrow[some])
         after = at - step
         after = torch.where((after > a) & (after < b), after, 0.5 * (a + b))
-        low[of], high[of], t[of] = a, b, torch.where(done, at, after)
+        low[some], high[some], t[some] = a, b, torch.where(done, at, after)
         of = of[~done]
     status[of] = int(Status.UNRESOLVED)
     return t, within(status, t, (ox, oy), (dx, dy), radius)

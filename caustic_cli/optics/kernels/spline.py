@@ -12,10 +12,12 @@ in a global one it is not (degree 7 loses everything in single precision).
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels.jit import FAST, njit
@@ -43,9 +45,12 @@ class Axis:
     """
 
     def __init__(self, space: SplineSpace):
-        first, middles, widths, matrices = space.pieces
-        self.space, self.first, self.matrices = space, first.numpy(), matrices.numpy()
-        self.geometry = (space.breaks.numpy(), middles.numpy(), (1.0 / widths).numpy())
+        breaks = space.breaks
+        middle, width = (breaks[1:] + breaks[:-1]) / 2.0, breaks.diff()
+        first, values = space.bases(middle, range(space.degree + 1))
+        rows = [value * (width**a / math.factorial(a))[:, None] for a, value in values.items()]
+        self.space, self.first, self.matrices = space, first.numpy(), torch.stack(rows, 1).contiguous().numpy()
+        self.geometry = (breaks.numpy(), middle.numpy(), (1.0 / width).numpy())
 
 
 @lru_cache(maxsize=16)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -73,10 +73,6 @@ class Surface(ABC, Generic[Heights]):
     def evaluate(self, heights: Heights, x: Tensor, y: Tensor) -> list[Tensor]:
         """Z, Z_x, Z_y at points (N,) mm, not differentiable by the points: (N,) float64 each."""
         return self.at(heights, x, y)
-
-    def function(self, heights: Heights, points: int) -> Callable[[Tensor, Tensor], Sequence[Tensor]]:
-        """Z, Z_x, Z_y as a function of points (N,) mm, without derivatives; points: of how many it will be."""
-        return lambda x, y: self.at(heights, x, y)
 
     def centred(self, heights: Heights) -> tuple[Heights, float]:
         """Heights of the surface shifted towards z = 0, and the shift, mm: small numbers keep more digits."""

@@ -11,7 +11,7 @@ whose cost does not depend on the degree.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -21,7 +21,7 @@ from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.bspline import PiecewiseBasis, SplineSpace, over_grid
+from caustic_cli.optics.bspline import SplineSpace, over_grid
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
 from caustic_cli.scene import Aperture, Lens
@@ -82,10 +82,8 @@ class HeightField(Surface[Tensor]):
                     )
                 )
             )
-        i, bu = su.basis(sample.u)
-        j, bv = sv.basis(sample.v)
-        du, dv = su.basis(sample.u, 1)[1] / (2 * rx), sv.basis(sample.v, 1)[1] / (2 * ry)
-        return _ScatteredEvaluator(i * sv.n + j, sv.n, *(b.to(dtype) for b in (bu, du, bv, dv)))
+        (i, bu), (j, bv) = su.bases(sample.u, (0, 1)), sv.bases(sample.v, (0, 1))
+        return _ScatteredEvaluator(i * sv.n + j, sv.n, *(b.to(dtype) for b in (bu[0], bu[1] / (2 * rx), bv[0], bv[1] / (2 * ry))))
 
     def at(self, heights: Tensor, x: Tensor, y: Tensor, orders: Sequence[tuple[int, int]] = FIRST) -> list[Tensor]:
         """Derivatives of these orders by x and y at points (N,) mm, each (N,) float64, mm^(1 - a - b); linear in the heights."""
@@ -101,10 +99,6 @@ class HeightField(Surface[Tensor]):
             along = {b: (row * basis).sum(1) for b, basis in bv.items()}
             totals = [total + bu[a][:, k] * along[b] for total, (a, b) in zip(totals, orders, strict=True)]
         return [cast(Tensor, t) / ((2.0 * rx) ** a * (2.0 * ry) ** b) for t, (a, b) in zip(totals, orders, strict=True)]
-
-    def function(self, heights: Tensor, points: int) -> Callable[[Tensor, Tensor], Sequence[Tensor]]:
-        """As of any surface; for more points than control points by the polynomials of all pieces."""
-        return PiecewiseSurface(self, heights) if points > heights.numel() else super().function(heights, points)
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
         """Upper bounds of |dz/dx| and |dz/dy|, by the convex hull property of the derivatives' control nets."""
@@ -149,46 +143,6 @@ class HeightField(Surface[Tensor]):
     def slope_bound(self, heights: Tensor) -> float:
         """An upper bound of |grad z|."""
         return math.hypot(*self.slope_bounds(heights))
-
-
-class PiecewiseSurface:
-    """A height field as a polynomial of xi^a eta^b on each of I x J span products: as quick to evaluate as to look up.
-
-    rows: for every b the coefficients (I J, p + 1).
-    """
-
-    def __init__(self, field: HeightField, heights: Tensor):
-        self.field, net = field, heights.double()
-        bases = [PiecewiseBasis(*(t.to(net.device) for t in s.pieces)) for s in field.spaces]
-        self.breaks = [s.breaks.to(net.device) for s in field.spaces]
-        self.middles, self.inverse = [b.middles for b in bases], [1.0 / b.widths for b in bases]
-        at_u, at_v = (b.first[:, None] + torch.arange(b.matrices.shape[2], device=net.device) for b in bases)
-        along_u = bases[0].matrices @ net[at_u]  # (I, p + 1, m)
-        local = along_u[:, :, at_v].transpose(1, 2)  # (I, J, p + 1, q + 1)
-        c = local @ bases[1].matrices.transpose(1, 2)
-        self.rows = [row.contiguous() for row in c.flatten(0, 1).unbind(2)]
-
-    def __call__(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """z, mm, z_x and z_y at points (N,) mm within the aperture."""
-        (i, xi, by_x), (j, eta, by_y) = (self._place(axis, c) for axis, c in enumerate((x, y)))
-        at = i * len(self.middles[1]) + j
-        row = self.rows[-1][at]  # (N, p + 1)
-        slope = torch.zeros_like(row)
-        for b in reversed(self.rows[:-1]):
-            slope = slope * eta[:, None] + row
-            row = row * eta[:, None] + b[at]
-        z, z_xi, z_eta = row[:, -1], torch.zeros_like(x), slope[:, -1]
-        for a in reversed(range(row.shape[1] - 1)):
-            z_xi = z_xi * xi + z
-            z, z_eta = z * xi + row[:, a], z_eta * xi + slope[:, a]
-        return z, z_xi * by_x, z_eta * by_y
-
-    def _place(self, axis: int, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Piece, xi and d xi / dx along an axis."""
-        r, middles, inverse = self.field.half_size[axis], self.middles[axis], self.inverse[axis]
-        u = 0.5 * (x / r + 1.0)
-        i = (torch.searchsorted(self.breaks[axis], u, right=True) - 1).clamp(0, len(middles) - 1)
-        return i, (u - middles[i]) * inverse[i], inverse[i] / (2.0 * r)
 
 
 class Evaluator:
