@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.interface import reflect, reflectance, reflectances, refract
-from caustic_cli.optics.kernels import mirror, refraction
+from caustic_cli.optics.interface import reflectance, reflectances, refract
+from caustic_cli.optics.kernels import refraction
 from caustic_cli.optics.kernels.grid import GridSurface
-from caustic_cli.optics.kernels.interact import interact
+from caustic_cli.optics.kernels.refraction import interact
 from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.polarisation import polarisation_vector, s_fraction
@@ -54,9 +54,7 @@ def flat(out) -> list[torch.Tensor]:
 # Stages by name: (inputs, kernel, reference), functions of the inputs.
 
 
-def plain_interact(d, g, power, *, eta, reflects, fresnel, field=None):
-    if reflects:
-        return reflect(d, *g)[0], power, torch.ones_like(power, dtype=torch.bool)
+def plain_interact(d, g, power, *, eta, fresnel, field=None):
     t, passes, c, s = refract(d, *g, eta)
     if field is not None and fresnel == "exact":
         (rs, rp), part = reflectances(c, s, eta), s_fraction(field, d, (-g[0], -g[1], 1.0))
@@ -127,23 +125,21 @@ def gridded(degree=(3, 2)):
 
 CASES = {
     **{
-        f"refract, {f}, eta {eta}": (interaction, {"eta": eta, "reflects": False, "fresnel": f})
+        f"refract, {f}, eta {eta}": (interaction, {"eta": eta, "fresnel": f})
         for f in ("none", "schlick", "exact")
         for eta in (1.5, 1.0 / 1.5)
     },
     **{
-        f"refract, {f}, plane wave": (interaction, {"constant": True, "eta": 1.5, "reflects": False, "fresnel": f})
+        f"refract, {f}, plane wave": (interaction, {"constant": True, "eta": 1.5, "fresnel": f})
         for f in ("none", "schlick", "exact")
     },
-    "refract, no other medium": (interaction, {"eta": 1.0, "reflects": False, "fresnel": "exact"}),
-    "polarised": (interaction, {"polarised": True, "eta": 1.5, "reflects": False, "fresnel": "exact"}),
-    "polarised, out of air": (interaction, {"polarised": True, "eta": 0.7, "reflects": False, "fresnel": "exact"}),
+    "refract, no other medium": (interaction, {"eta": 1.0, "fresnel": "exact"}),
+    "polarised": (interaction, {"polarised": True, "eta": 1.5, "fresnel": "exact"}),
+    "polarised, out of air": (interaction, {"polarised": True, "eta": 0.7, "fresnel": "exact"}),
     "polarised, plane wave": (
         interaction,
-        {"constant": True, "polarised": True, "eta": 1.5, "reflects": False, "fresnel": "exact"},
+        {"constant": True, "polarised": True, "eta": 1.5, "fresnel": "exact"},
     ),
-    "mirror": (interaction, {"eta": 1.5, "reflects": True, "fresnel": "exact"}),
-    "mirror, plane wave": (interaction, {"constant": True, "eta": 1.5, "reflects": True, "fresnel": "none"}),
     "land": (landing, {"screen": SCREEN}),
     "land, tilted": (landing, {"screen": TILTED}),
     "land, back": (landing, {"screen": TILTED, "forward": -1.0}),
@@ -250,14 +246,13 @@ def test_two_threads_give_the_same(case):
         {"fresnel": "exact"},
         {"fresnel": "exact", "field": (0.6, 0.8, 0.0)},
         {"fresnel": "none"},
-        {"fresnel": "none", "reflects": True},
     ],
     ids=str,
 )
 @pytest.mark.parametrize("eta", [1.5, 0.7])
 def test_light_against_the_normal(eta, options):
     """The same as in the scene turned over, z -> -z, where it runs along the normal: d_z, E_z and the slopes change sign."""
-    options = {"eta": eta, "reflects": False} | options
+    options = {"eta": eta} | options
     d, g, power = directions(1), list(0.4 * numbers(2, 2, RAYS)), numbers(3, RAYS).abs()
     d[2] = -d[2]
     results = []
@@ -284,7 +279,7 @@ def test_total_reflection_passes_nothing_and_stays_finite():
     gx = torch.tensor([0.0, 0.8, 0.95, 5.0, 1e3], dtype=torch.float64)  # of index 1.5 the critical slope is 0.894
     for fresnel in ("none", "schlick", "exact"):
         leaves = [t.clone().requires_grad_() for t in (gx, 0.0 * gx, torch.ones_like(gx))]
-        t, after, passes = interact((0.0, 0.0, 1.0), leaves[:2], leaves[2], eta=1.5, reflects=False, fresnel=fresnel, field=None)
+        t, after, passes = interact((0.0, 0.0, 1.0), leaves[:2], leaves[2], eta=1.5, fresnel=fresnel, field=None)
         assert passes.tolist() == [True, True, False, False, False]
         assert after.detach()[2:].tolist() == [0.0, 0.0, 0.0]
         gradients = torch.autograd.grad(sum(c.sum() for c in t) + after.sum(), leaves)
@@ -293,21 +288,18 @@ def test_total_reflection_passes_nothing_and_stays_finite():
 
 
 def test_directions_are_of_unit_length_and_power_is_kept_without_losses():
-    (*d, gx, gy, power), _, _ = interaction(eta=1.5, reflects=False, fresnel="none")
-    t, after, passes = interact(tuple(d), (gx, gy), power, eta=1.5, reflects=False, fresnel="none")
+    (*d, gx, gy, power), _, _ = interaction(eta=1.5, fresnel="none")
+    t, after, passes = interact(tuple(d), (gx, gy), power, eta=1.5, fresnel="none")
     length = sum(c * c for c in t)[passes]
     assert not bool(passes.all())
     torch.testing.assert_close(length, torch.ones_like(length), rtol=0, atol=1e-14)
     assert torch.equal(after, torch.where(passes, power, torch.zeros_like(power)))
-    t, after, passes = interact(tuple(d), (gx, gy), power, eta=1.5, reflects=True, fresnel="exact")
-    assert bool(passes.all())
-    assert torch.equal(after, power)
 
 
 def test_without_power_nothing_is_lost():
-    (*d, gx, gy, power), _, _ = interaction(eta=1.5, reflects=False, fresnel="exact")
+    (*d, gx, gy, power), _, _ = interaction(eta=1.5, fresnel="exact")
     leaves = [gx.requires_grad_(), gy.requires_grad_()]
-    _, after, _ = interact(tuple(d), leaves, torch.zeros_like(power), eta=1.5, reflects=False, fresnel="exact")
+    _, after, _ = interact(tuple(d), leaves, torch.zeros_like(power), eta=1.5, fresnel="exact")
     assert not bool(after.any())
     assert not any(bool(g.any()) for g in torch.autograd.grad(after.sum(), leaves))
 
@@ -318,7 +310,7 @@ def test_polarised_light_in_normal_incidence_is_any_light():
     results = []
     for field in (None, polarisation_vector(30.0, (0.0, 0.0, 1.0)), tuple(one * c for c in (0.6, 0.8, 0.0))):
         leaves = [t.clone().requires_grad_() for t in (none, none, one)]
-        t, after, _ = interact((0.0, 0.0, 1.0), leaves[:2], leaves[2], eta=1.5, reflects=False, fresnel="exact", field=field)
+        t, after, _ = interact((0.0, 0.0, 1.0), leaves[:2], leaves[2], eta=1.5, fresnel="exact", field=field)
         results.append([after.detach(), *torch.autograd.grad(after.sum() + t[0].sum(), leaves)])
     assert float(results[0][0][0]) == pytest.approx(0.96, rel=1e-15)
     for other in results[1:]:
@@ -327,10 +319,10 @@ def test_polarised_light_in_normal_incidence_is_any_light():
 
 
 def test_a_field_that_losses_do_not_heed_has_no_derivative():
-    (*d, gx, gy, power), _, _ = interaction(eta=1.5, reflects=False, fresnel="none")
+    (*d, gx, gy, power), _, _ = interaction(eta=1.5, fresnel="none")
     field = [c.requires_grad_() for c in directions(5)]
-    for fresnel, reflects in (("none", False), ("schlick", False), ("exact", True)):
-        t, after, _ = interact(tuple(d), (gx, gy), power, eta=1.5, reflects=reflects, fresnel=fresnel, field=tuple(field))
+    for fresnel in ("none", "schlick"):
+        t, after, _ = interact(tuple(d), (gx, gy), power, eta=1.5, fresnel=fresnel, field=tuple(field))
         assert not any(c.requires_grad for c in (*t, after))
 
 
@@ -387,19 +379,18 @@ def test_a_bincount_has_no_derivative_by_the_landing_points():
 
 def test_numbers_and_tensors_share_one_compiled_kernel():
     for options in ({"constant": True}, {}, {"polarised": True}):
-        for reflects in (False, True):
-            inputs, kernel, _ = interaction(**options, eta=1.5, reflects=reflects, fresnel="exact")
-            leaves = [t.requires_grad_() for t in inputs]
-            t, after, _ = kernel(*leaves)
-            (sum(c.sum() for c in t) + after.sum()).backward()
-    for kernel in (*refraction.REFRACT.kernels, *mirror.REFLECT.kernels):
+        inputs, kernel, _ = interaction(**options, eta=1.5, fresnel="exact")
+        leaves = [t.requires_grad_() for t in inputs]
+        t, after, _ = kernel(*leaves)
+        (sum(c.sum() for c in t) + after.sum()).backward()
+    for kernel in refraction.REFRACT.kernels:
         assert len(kernel.signatures) == 1
 
 
 def test_a_second_derivative_is_refused():
-    (*d, gx, gy, power), _, _ = interaction(eta=1.5, reflects=False, fresnel="none")
+    (*d, gx, gy, power), _, _ = interaction(eta=1.5, fresnel="none")
     gx.requires_grad_()
-    t, _, _ = interact(tuple(d), (gx, gy), power, eta=1.5, reflects=False, fresnel="none")
+    t, _, _ = interact(tuple(d), (gx, gy), power, eta=1.5, fresnel="none")
     (first,) = torch.autograd.grad((t[0] * t[0]).sum(), gx, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         first.sum().backward()

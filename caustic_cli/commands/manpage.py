@@ -248,8 +248,7 @@ The command line takes precedence.
 Defaults of the options that most commands share.
 .TP
 .B CAUSTIC_KERNELS
-"torch" selects the plain\-torch reference instead of the compiled kernels, also on a CUDA device, where \-\-dtype float32 then
-takes effect.
+"torch" selects the plain\-torch reference instead of the compiled kernels of a CPU; a CUDA device always uses it.
 .TP
 .B NUMBA_CACHE_DIR
 Directory of the compiled kernels; by default caustic in XDG_CACHE_HOME or in ~/.cache.  If it cannot be written, a private

@@ -120,7 +120,9 @@ class OnDevice(Debugging):
         int | None,
         typer.Option(envvar="CAUSTIC_SEED", help="Seed of all random numbers; the same seed gives the same bytes.  [default: 0]"),
     ] = None
-    device: Annotated[str, typer.Option(envvar="CAUSTIC_DEVICE", help="auto, cpu or cuda.")] = "auto"
+    device: Annotated[
+        str, typer.Option(envvar="CAUSTIC_DEVICE", help="cpu or cuda; auto is cpu, which gives the same bytes every time.")
+    ] = "auto"
     dtype: Annotated[
         str | None,
         typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU kernels always use float64."),

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull, cKDTree
 
 from caustic_cli.inverse.transport import point_masses
@@ -89,7 +90,10 @@ class LowerHull:
         points = (points - points.mean(0)) / np.ptp(points, axis=0)
         hull = ConvexHull(points, qhull_options=OPTIONS)
         below = hull.simplices[hull.equations[:, 2] < 0.0]
-        return laguerre.adjacency(below, len(points))
+        edges = np.concatenate([below[:, [0, 1, 2]].ravel(), below[:, [1, 2, 0]].ravel()])
+        ends = np.concatenate([edges[edges.size // 2 :], edges[: edges.size // 2]])
+        graph = csr_matrix((np.ones(len(edges), bool), (edges, ends)), (len(points), len(points)))
+        return graph.indptr.astype(np.int64), graph.indices
 
     def borders(self, site: np.ndarray) -> tuple[np.ndarray, ...]:
         """As of `laguerre.borders`, also of cells too narrow for a raster."""

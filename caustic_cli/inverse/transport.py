@@ -538,7 +538,7 @@ def _cells(psi: np.ndarray, sites: _Sites, raster: list, light: _Light) -> tuple
         psi[missing], touched = envelope.touched(missing, phi, site, raster, light.inside)
         distance = np.hypot(sites.y1[missing] - sites.y1[touched], sites.y2[missing] - sites.y2[touched])
         bond = BOND * np.sqrt(sites.mass[missing] * light.cells.mean()) / distance
-    return psi, mass, (*net[:3], weight, mass, sites.mass, missing, touched, bond)
+    return psi, mass, (net[2], weight, mass, sites.mass, missing, touched, bond)
 
 
 def _newton(psi, sites: _Sites, raster: list, light: _Light, tolerance: float, most: int) -> tuple[np.ndarray, float, int]:
@@ -549,7 +549,7 @@ def _newton(psi, sites: _Sites, raster: list, light: _Light, tolerance: float, m
     for step in range(most):
         if error < tolerance or len(psi) == 1:
             return psi, error, step
-        change, _ = multigrid.Multigrid(*multigrid.matrix(*graph)).solve(excess - excess.mean(), LINEAR_TOLERANCE)
+        change, _ = multigrid.Multigrid(multigrid.matrix(*graph)).solve(excess - excess.mean(), LINEAR_TOLERANCE)
         change -= change.mean()
         length, best = 1.0, None
         while length > 0.05:

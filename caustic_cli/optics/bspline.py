@@ -134,29 +134,36 @@ class SplineSpace:
         Returns:
             first (...) int64, values (..., p + 1) float64.
         """
-        x = x.double()
+        first, values = self.bases(x, [derivative])
+        return first, values[derivative]
+
+    def bases(self, x: Tensor, orders: Iterable[int]) -> tuple[Tensor, dict[int, Tensor]]:
+        """`basis` for every order of derivative in `orders`, by one triangular scheme."""
+        x, orders = x.double(), list(orders)
         s = self.span(x)
         p, t = self.degree, self.knots.to(x.device)
-        if derivative > p:
-            return s - p, torch.zeros(*x.shape, p + 1, dtype=torch.float64, device=x.device)
-        low = p - derivative
-        values = [torch.ones_like(x)]  # degree 0 on the span
-        for k in range(1, low + 1):  # raise the degree one at a time
+        near = {k: t[s + k] for k in range(1 - p, p + 1)}
+        of_degree = [[torch.ones_like(x)]]  # values on the span, of degree 0, 1, ...
+        for k in range(1, p - min(orders) + 1):  # raise the degree one at a time
             nxt, saved = [], torch.zeros_like(x)
-            for r in range(k):
-                right, left = t[s + r + 1], t[s + r + 1 - k]
-                term = values[r] / (right - left)  # t_{s+1} > t_s lies inside: never 0
+            for r, value in enumerate(of_degree[-1]):
+                right, left = near[r + 1], near[r + 1 - k]
+                term = value / (right - left)  # t_{s+1} > t_s lies inside: never 0
                 nxt.append(saved + (right - x) * term)
                 saved = (x - left) * term
-            values = [*nxt, saved]
-        for k in range(low + 1, p + 1):  # eq. 2.4.9: N'_{i,k} = k N_{i,k-1} / (t_{i+k} - t_i) - k N_{i+1,k-1} / (...)
-            nxt, saved = [], torch.zeros_like(x)
-            for r in range(k):
-                term = k * values[r] / (t[s + r + 1] - t[s + r + 1 - k])
-                nxt.append(saved - term)
-                saved = term
-            values = [*nxt, saved]
-        return s - p, torch.stack(values, -1)
+            of_degree.append([*nxt, saved])
+        out = {}
+        for order in orders:
+            values = of_degree[p - order] if order <= p else [torch.zeros_like(x)] * (p + 1)
+            for k in range(len(values), p + 1):  # eq. 2.4.9: N'_{i,k} = k N_{i,k-1} / (t_{i+k} - t_i) - k N_{i+1,k-1} / (...)
+                nxt, saved = [], torch.zeros_like(x)
+                for r, value in enumerate(values):
+                    term = k * value / (near[r + 1] - near[r + 1 - k])
+                    nxt.append(saved - term)
+                    saved = term
+                values = [*nxt, saved]
+            out[order] = torch.stack(values, -1)
+        return s - p, out
 
     def matrix(self, x: Tensor, derivative: int = 0) -> Tensor:
         """Collocation matrix of all n basis functions at the points x (m,): (m, n) float64, dense."""

@@ -156,19 +156,23 @@ def reference(
     low = torch.where(possible, low, torch.zeros_like(low))
     high = torch.where(possible, high, torch.zeros_like(high))
 
-    def f(t: Tensor, of: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
+    def f(t: Tensor, of: Tensor | slice) -> tuple[Tensor, Tensor]:
+        if not len(t):
+            return t, t
         x, y = ox[of] + t * dx[of], oy[of] + t * dy[of]
         if rx < torch.inf:
             x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
         z, zx, zy = surface.at(h, x, y)
         return oz[of] + t * dz[of] - side * z, dz[of] - side * (zx * dx[of] + zy * dy[of])
 
-    f_low = f(low)[0]
     status = torch.where(possible, int(Status.HIT), int(Status.MISSED))
-    at_once = f_low >= 0
-    status = torch.where(at_once & (low <= enter) & (f_low > 0), int(Status.MISSED), status)
     bound = surface.slope_bounds(h)
     slope = bound[0] * dx.abs() + bound[1] * dy.abs()
+    within_box = (possible & ((low <= enter) | (slope >= dz))).nonzero()[:, 0]  # others begin below all of the surface
+    f_low = torch.full_like(low, -torch.inf)
+    f_low[within_box] = f(low[within_box], within_box)[0]
+    at_once = f_low >= 0
+    status = torch.where(at_once & (low <= enter) & (f_low > 0), int(Status.MISSED), status)
     unsafe = ((slope >= dz) & (status == Status.HIT) & ~at_once).nonzero()[:, 0]
     if len(unsafe):
         valid = _first_brackets(
@@ -181,20 +185,23 @@ def reference(
     close, narrow = FEW_ULP * size, FEW_ULP * torch.maximum(high, size)
     t = torch.where(at_once, low, ((0.5 * (low_z + high_z) - oz) / dz).clamp(low, high))
     busy = (status == Status.HIT) & ~at_once
-    reaches = closed | (f(torch.where(busy, high, low))[0] >= 0)
-    status = torch.where(busy & ~reaches, int(Status.MISSED), status)
-    busy &= reaches
+    doubtful = (busy & ~closed).nonzero()[:, 0]
+    status[doubtful[f(high[doubtful], doubtful)[0] < 0]] = int(Status.MISSED)
+    of = (busy & (status == Status.HIT)).nonzero()[:, 0]
     for _ in range(MOST_STEPS):
-        if not bool(busy.any()):
+        if not len(of):
             break
-        value, slope_f = f(t)
-        low, high = torch.where(busy & (value < 0), t, low), torch.where(busy & (value >= 0), t, high)
+        some = slice(None) if len(of) == len(t) else of  # of all rays nothing has to be looked up
+        at = t[some]
+        value, slope_f = f(at, some)
+        a, b = torch.where(value < 0, at, low[some]), torch.where(value >= 0, at, high[some])
         step = value / slope_f
-        busy &= ~(((value.abs() <= close) & (step.abs() <= narrow)) | (high - low <= narrow))
-        after = t - step
-        after = torch.where((after > low) & (after < high), after, 0.5 * (low + high))
-        t = torch.where(busy, after, t)
-    status = torch.where(busy, int(Status.UNRESOLVED), status)
+        done = ((value.abs() <= close[some]) & (step.abs() <= narrow[some])) | (b - a <= narrow[some])
+        after = at - step
+        after = torch.where((after > a) & (after < b), after, 0.5 * (a + b))
+        low[some], high[some], t[some] = a, b, torch.where(done, at, after)
+        of = of[~done]
+    status[of] = int(Status.UNRESOLVED)
     return t, within(status, t, (ox, oy), (dx, dy), radius)
 
 

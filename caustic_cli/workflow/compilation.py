@@ -13,7 +13,7 @@ from numba.core import event
 
 from caustic_cli.errors import is_out_of_memory
 from caustic_cli.inverse.schedule import Stage
-from caustic_cli.optics.backends import backend_for, cuda_kernels
+from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.kernels.ahead import PARTS, compile_behind, compile_part
@@ -29,18 +29,10 @@ PATIENCE = 2.0
 
 
 def choose_device(asked: str, say: Reporter) -> str:
-    """The device for auto, cpu or cuda: auto selects a CUDA device if torch finds one and numba has kernels for it."""
-    if asked == "cpu" or not torch.cuda.is_available():
+    """The device for auto, cpu or cuda: auto selects the CPU, whose results are the same bits every time."""
+    if asked != "cuda":
         return "cpu"
-    name, kernels = torch.cuda.get_device_name(), cuda_kernels()
-    if kernels:
-        say.say(f"tracing on {name}, by kernels")
-        return "cuda"
-    lacking = "numba has no kernels for it (pip install 'caustic-cli[cuda]' brings what they need)"
-    if asked == "auto":
-        say.say(f"tracing on the CPU: there is {name}, but {lacking}")
-        return "cpu"
-    say.say(f"tracing on {name} in plain torch: {lacking}")
+    say.say(f"tracing on {torch.cuda.get_device_name()}, in plain torch")
     return "cuda"
 
 

@@ -16,7 +16,7 @@ import torch
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels.grid import GridSurface
-from caustic_cli.optics.kernels.interact import interact
+from caustic_cli.optics.kernels.refraction import interact
 from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.reconstruction import Filter
@@ -63,8 +63,8 @@ def stages() -> dict:
     surface = GridSurface((space, space), (10.0, 10.0), at, at)
     heights = torch.randn(50, 50, generator=generator, dtype=torch.float64).requires_grad_()
 
-    def bend(direction, fresnel: str, reflects: bool = False, field=None):
-        return lambda: interact(direction, g, power, eta=1.544, reflects=reflects, fresnel=fresnel, field=field)
+    def bend(direction, fresnel: str, field=None):
+        return lambda: interact(direction, g, power, eta=1.544, fresnel=fresnel, field=field)
 
     along = (0.0, 0.0, 1.0)
     filters = [Filter(), Filter("gaussian", (3, 3), (ALPHA, ALPHA)), Filter("cosine", (3, 3)), Filter("cosine", (11, 11))]
@@ -72,7 +72,6 @@ def stages() -> dict:
         "grid": (lambda: surface(heights), [heights]),
         **{f"interact, plane wave, {f}": (bend(along, f), [*g]) for f in ("none", "schlick", "exact")},
         "interact, plane wave, polarised": (bend(along, "exact", field=(1.0, 0.0, 0.0)), [*g]),
-        "interact, plane wave, mirror": (bend(along, "none", True), [*g]),
         "interact, any direction, exact": (bend(d, "exact"), [*d, *g, power]),
         "land, plane wave": (lambda: land((x, y, z), d, (0.0, 0.0, 300.0), UPRIGHT, 1.0), [z, *d]),
         "land, any direction": (lambda: land((px, py, z), d, (0.0, 0.0, 300.0), UPRIGHT, 1.0), [px, py, z, *d]),

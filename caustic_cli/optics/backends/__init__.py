@@ -11,10 +11,9 @@ Stages, each with its adjoint
     splat                      accumulation on pixels
     phase, exposure, path_change   of the wave image: a field's phase, its power on pixels, and changes of its optical paths
 
-`reference.Torch` implements every stage in plain torch, on any device; `cpu.Numba` and `cuda.Cuda` use compiled kernels.  Callers
-do not depend on which one is used.  The kernels are differentiated in reverse mode only: within a dual level of forward mode the
-reference stands in for every one.  CAUSTIC_KERNELS=torch selects the reference; CAUSTIC_KERNELS=cuda the device's kernels also on
-a CPU, in numba's simulator (NUMBA_ENABLE_CUDASIM=1), for tests.
+`reference.Torch` implements every stage in plain torch, on any device; `cpu.Numba` uses compiled kernels.  Callers do not depend
+on which one is used.  The kernels are differentiated in reverse mode only: within a dual level of forward mode the reference stands
+in for them.  CAUSTIC_KERNELS=torch selects the reference on a CPU, too.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
 
 #: Name -> module and class, imported on demand: surfaces and backends refer to each other, and numba is slow to load.
-BACKENDS = {"torch": ("reference", "Torch"), "numba": ("cpu", "Numba"), "cuda": ("cuda", "Cuda")}
+BACKENDS = {"torch": ("reference", "Torch"), "numba": ("cpu", "Numba")}
 #: A fused kernel: heights, upright screen and filter -> image, power behind the surface, and losses there.
 Fused = Callable[[Tensor, Screen, Filter], tuple[Tensor, Tensor, dict]]
 #: Accepted values of CAUSTIC_KERNELS.
-KERNELS = ("", "torch", "cuda")
+KERNELS = ("", "torch")
 
 
 def in_forward_mode() -> bool:
@@ -47,28 +46,17 @@ def in_forward_mode() -> bool:
 
 
 def backend_for(device: torch.device | str):
-    """The backend for tensors on `device`; the reference in forward mode."""
+    """The backend for tensors on `device`: the kernels on a CPU, the reference elsewhere and in forward mode."""
     kernels = os.environ.get("CAUSTIC_KERNELS", "")
     if kernels not in KERNELS:
-        raise InputError(f"the environment's CAUSTIC_KERNELS must be torch or cuda, or not be set, got {kernels!r}")
-    if kernels == "torch" or in_forward_mode():
-        return _made("torch")
-    if torch.device(device).type == "cpu":
-        return _made("cuda" if kernels == "cuda" and os.environ.get("NUMBA_ENABLE_CUDASIM") == "1" else "numba")
-    return _made("cuda" if cuda_kernels() else "torch")
+        raise InputError(f"the environment's CAUSTIC_KERNELS must be torch, or not be set, got {kernels!r}")
+    plain = kernels == "torch" or in_forward_mode() or torch.device(device).type != "cpu"
+    return _made("torch" if plain else "numba")
 
 
 def usable(backend):
     """The backend itself; in forward mode the reference."""
     return _made("torch") if in_forward_mode() else backend
-
-
-@cache
-def cuda_kernels() -> bool:
-    """Whether CUDA kernels can be compiled: numba finds a device and a compiler, which the extra `cuda` installs."""
-    from numba import config, cuda  # noqa: PLC0415
-
-    return not config.ENABLE_CUDASIM and cuda.is_available()  # type: ignore[attr-defined]  # numba makes its settings as it is loaded
 
 
 @contextlib.contextmanager

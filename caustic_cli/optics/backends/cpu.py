@@ -23,9 +23,9 @@ from caustic_cli.optics.gradient.integrator import WEIGHTS, Flow
 from caustic_cli.optics.interface import OutgoingRays
 from caustic_cli.optics.kernels import fused_functions
 from caustic_cli.optics.kernels.grid import GridSurface
-from caustic_cli.optics.kernels.interact import interact
 from caustic_cli.optics.kernels.polynomial_index import formula_flow
 from caustic_cli.optics.kernels.ray_intersections import RayIntersections, hits_of_rays
+from caustic_cli.optics.kernels.refraction import interact
 from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.kernels.spline_index import volume_axis, volume_flow
 from caustic_cli.optics.kernels.surface import FusedSurface, next_intersections, scattered_surface
@@ -160,13 +160,13 @@ class Numba(Torch):
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
     ) -> OutgoingRays:
-        """As the reference, which handles constant slopes; the kernel infers the side from the sign of d . N."""
-        if not isinstance(slopes[0], Tensor):
+        """As the reference, which handles mirrors and constant slopes; the kernel infers the side from the sign of d . N."""
+        if reflects or not isinstance(slopes[0], Tensor):
             return super().interact(
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
             )
         direction, polarised = _components(direction), None if polarised is None else _components(polarised)
-        return OutgoingRays(*interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
+        return OutgoingRays(*interact(direction, slopes, power, eta=eta, fresnel=fresnel, field=polarised))
 
     def phase(self, path: Tensor, sampling, length: float, behind: float, dtype: torch.dtype) -> Tensor:
         """As the reference, which handles float64."""
@@ -247,21 +247,12 @@ class PencilImage:
     def __init__(
         self, field, pencil: Pencil, entrance: tuple[float, str], emission, interface: tuple[float, str], like: PencilImage | None
     ):
-        self.interface, s, self.emitted = interface, pencil.sample, pencil.emitted
+        self.interface, self.emitted = interface, pencil.emitted
         #: Power through the pupil, and less what the entrance reflects, ().
         self.entering, self.passed = pencil.entering(*entrance)
+        before = like.kernel if isinstance(like, PencilImage) else None
         self.kernel: fused_functions.PencilKernel = fused_functions.PencilKernel(
-            field.spaces,
-            field.half_size,
-            s.u,
-            s.v,
-            s.flux,
-            pencil.position[:2],
-            pencil.distance,
-            pencil.z_in,
-            entrance[0],
-            emission,
-            like.kernel if isinstance(like, PencilImage) else None,
+            field.spaces, field.half_size, pencil, entrance[0], emission, before
         )
 
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:

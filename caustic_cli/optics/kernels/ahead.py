@@ -29,12 +29,10 @@ def _multigrid() -> None:
     from caustic_cli.optics.kernels import multigrid  # noqa: PLC0415
 
     count = 5 * multigrid.SMALLEST
-    start = np.array([0, *range(1, 2 * count - 2, 2), 2 * count - 2])
-    column = np.array([q for p in range(count) for q in (p - 1, p + 1) if 0 <= q < count], np.int32)
-    solver = multigrid.Multigrid(start, column, np.full(len(column), -1.0), np.full(count, 2.0))
-    solver.solve(np.linspace(-1.0, 1.0, count), 0.1)
-    half, none, one = np.full(2, -1, np.int32), np.zeros(0, np.int64), np.ones(2)
-    multigrid.matrix(half, half[:0], half[:0], one[:0], one, one, none, none, one[:0])
+    sites, one, none = np.arange(count - 1), np.ones(count), np.zeros(0, np.int64)
+    end = np.stack([sites + 1, sites], 1).ravel()
+    a = multigrid.matrix(end, np.ones(len(end)), one, one, none, none, one[:0])
+    multigrid.Multigrid(a).solve(np.linspace(-1.0, 1.0, count), 0.1)
 
 
 def _surface() -> None:
@@ -49,11 +47,11 @@ def _refraction() -> None:
     import torch  # noqa: PLC0415
 
     from caustic_cli.optics.bspline import SplineSpace  # noqa: PLC0415
-    from caustic_cli.optics.kernels.interact import interact  # noqa: PLC0415
+    from caustic_cli.optics.kernels.refraction import interact  # noqa: PLC0415
     from caustic_cli.optics.kernels.surface import FusedSurface  # noqa: PLC0415
 
     one, space = torch.ones(1, dtype=torch.float64), SplineSpace.uniform(6, 3)
-    interact((0.0, 0.0, 1.0), (0.0 * one, 0.0 * one), one, eta=1.5, reflects=False, fresnel="exact")
+    interact((0.0, 0.0, 1.0), (0.0 * one, 0.0 * one), one, eta=1.5, fresnel="exact")
     FusedSurface((space, space), (1.0, 1.0)).evaluate(torch.zeros(6, 6), np.ones(1), np.ones(1))
 
 
@@ -83,7 +81,7 @@ def _adjoint() -> None:
 #: in the transport and what it needs first of the surface: one of its kernels, by whose presence in the cache a part is
 #: known to be compiled, and a function that calls all of them.
 PARTS: dict[str, tuple[str, Callable[[], None]]] = {
-    "multigrid": ("multigrid.matrix", _multigrid),
+    "multigrid": ("multigrid.sweep", _multigrid),
     "refraction": ("spline.evaluate_net", _refraction),
     "surface": ("spline.pull_coefficients", _surface),
     "fields": ("fields.pull_displacement", _fields),

@@ -20,10 +20,9 @@ class AlongV:
     """Basis values at points v (b,), and derivatives times `scale`, for nets (n, m) whose second axis is `space`'s."""
 
     def __init__(self, space: SplineSpace, v: Tensor, scale: float):
-        first, values = space.basis(v)
-        slopes = space.basis(v, 1)[1] * scale
+        first, values = space.bases(v, (0, 1))
         self.size = space.n
-        self.arrays = (first.numpy(), *(t.contiguous().numpy() for t in (values, slopes)))
+        self.arrays = (first.numpy(), *(t.contiguous().numpy() for t in (values[0], values[1] * scale)))
 
     def __call__(self, net: Tensor) -> tuple[Tensor, Tensor]:
         """Net (n, m) float64 -> the spline's values and scaled derivatives along v at every point: (n, b) each, differentiable."""

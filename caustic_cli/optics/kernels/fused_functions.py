@@ -28,6 +28,7 @@ from caustic_cli.optics.kernels.arguments import (
 )
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.fresnel import FRESNEL
+from caustic_cli.optics.kernels.grid import rows_at
 from caustic_cli.optics.kernels.ray_intersections import RayIntersections
 from caustic_cli.optics.kernels.splat import trimmed
 from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
@@ -38,6 +39,7 @@ from caustic_cli.scene import Screen
 
 if TYPE_CHECKING:
     from caustic_cli.optics.beam import Beam
+    from caustic_cli.optics.pencil import Pencil
 
 #: A source point, or parallel light at an angle to z; neither for other rays.
 Light = tuple[Point | None, ParallelLight | None]
@@ -76,7 +78,7 @@ class PlaneKernel:
         self.tensor, self.v = tensor, v
         self.workspace: _Workspace = _Workspace() if like is None else like.workspace
         if tensor:
-            self.rows = _rows(su, u, rx)
+            self.rows = rows_at(su, u, rx)
             self.along_v: AlongV = like.along_v if like is not None and like.v is v else AlongV(sv, v, 1.0 / (2.0 * ry))
             x, y, shape = u[:, None], v[None, :], (len(u), len(v))
         else:
@@ -183,35 +185,23 @@ class PencilKernel:
 
     Args:
         spaces, half_size: of the height field; half widths in mm.
-        u, v: parameters of the points, which are all pairs of them; area: of the aperture for each, mm^2, scalar or (a, b).
-        place: (x, y) of the source, mm; distance: of it from the entrance, which lies at z_in, mm; index: n of the entrance.
-        emission: J, by `pencil.polynomial`, and the largest s.
+        pencil: the rays; index: n of the entrance; emission: J, by `pencil.polynomial`, and the largest s.
         like: the kernel of another chunk, whose basis values along v serve again where v is the same tensor, with its workspace.
     """
 
     def __init__(
-        self,
-        spaces,
-        half_size,
-        u: Tensor,
-        v: Tensor,
-        area: Tensor,
-        place: tuple[float, float],
-        distance: float,
-        z_in: float,
-        index: float,
-        emission: tuple[np.ndarray, float],
-        like: PencilKernel | None = None,
+        self, spaces, half_size, pencil: Pencil, index: float, emission: tuple[np.ndarray, float], like: PencilKernel | None = None
     ):
-        (su, sv), (rx, ry) = spaces, half_size
-        self.v, self.rows = v, _rows(su, u, rx)
+        (su, sv), (rx, ry), u, v, area = spaces, half_size, pencil.sample.u, pencil.sample.v, pencil.sample.flux
+        self.v, self.rows = v, rows_at(su, u, rx)
         self.along_v: AlongV = like.along_v if like is not None and like.v is v else AlongV(sv, v, 1.0 / (2.0 * ry))
         self.workspace: _Workspace = _Workspace() if like is None else like.workspace
-        x, y = ((2.0 * c - 1.0) * r - p for c, r, p in zip((u, v), half_size, place, strict=True))
+        self.place, self.distance, self.z_in, self.index = pencil.position[:2], pencil.distance, pencil.z_in, index
+        x, y = ((2.0 * c - 1.0) * r - p for c, r, p in zip((u, v), half_size, self.place, strict=True))
         at = (_strided(np.broadcast_to(c.double().numpy(), (len(u), len(v)))) for c in (x[:, None], y[None, :], area))
         own_x, own_y, areas = at
         self.rays = RowsOfRays(own_x, own_y, _NONE, _NONE, areas)
-        (self.coefficients, most), self.place, self.distance, self.z_in, self.index = emission, place, distance, z_in, index
+        self.coefficients, most = emission
         self.scale = 2.0 / most
         self.reach2 = float(x.abs().max() ** 2 + y.abs().max() ** 2)
 
@@ -275,12 +265,6 @@ def _splat(
     lost = {"missed_surface": ledger[fused.MISSED]} if rays.along_x is not _NONE else {}
     lost |= {"fresnel": ledger[fused.LOST_BY_FRESNEL], "total_internal_reflection": ledger[fused.REFLECTED]}
     return image, leaving, lost | {"off_screen": ledger[fused.OFF_SCREEN] + beside.detach()}
-
-
-def _rows(space: SplineSpace, u: Tensor, half: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The first three of `RowsOfSurface` for points u, of a surface of this half width, mm."""
-    first, values = space.basis(u)
-    return first.numpy(), values.contiguous().numpy(), (space.basis(u, 1)[1] / (2.0 * half)).contiguous().numpy()
 
 
 def _arguments(

@@ -28,6 +28,12 @@ from caustic_cli.optics.kernels.rows import combine, spread
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
+def rows_at(space: SplineSpace, u: Tensor, half: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The first three of `RowsOfSurface` for points u, of a surface of this half width, mm."""
+    first, values = space.bases(u, (0, 1))
+    return first.numpy(), values[0].contiguous().numpy(), (values[1] / (2.0 * half)).contiguous().numpy()
+
+
 class GridSurface:
     """A height field on a fixed grid of points, prepared for any heights.
 
@@ -38,9 +44,7 @@ class GridSurface:
 
     def __init__(self, spaces: tuple[SplineSpace, SplineSpace], half_size: tuple[float, float], u: Tensor, v: Tensor):
         (su, sv), (rx, ry) = spaces, half_size
-        first, bu = su.basis(u)
-        du = su.basis(u, 1)[1] / (2.0 * rx)
-        self.rows = tuple(t.contiguous().numpy() for t in (first, bu.double(), du.double()))
+        self.rows = rows_at(su, u, rx)
         self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry))
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -148,8 +148,7 @@ def _root(ray, start, limits, slope, c, pieces):
 def intersect(block, rays, start, limits, slopes, c, pieces, t, status, blocks):
     """First intersections of rays (o_u, o_v, o_z, d_u, d_v, d_z), (N,) each, into t and status (N,).
 
-    limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,): estimates of t, infinite for none; or
-    empty, if unknown.
+    limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,): estimates of t, infinite for none.
     """
     if block == ALL:
         on_threads(blocks, (rays, start, limits, slopes, c, pieces, t, status, blocks))
@@ -159,11 +158,10 @@ def intersect(block, rays, start, limits, slopes, c, pieces, t, status, blocks):
     for k in range(block * count // blocks, (block + 1) * count // blocks):
         ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
         slope = slopes[0] * abs(du[k]) + slopes[1] * abs(dv[k])
-        begin = start[k] if len(start) else -1.0
-        if begin == np.inf:
+        if start[k] == np.inf:
             t[k], status[k] = 0.0, MISSED
             continue
-        t[k], status[k] = _root(ray, begin, limits, slope, c, pieces)
+        t[k], status[k] = _root(ray, start[k], limits, slope, c, pieces)
 
 
 @njit(entry=True, **FAST)

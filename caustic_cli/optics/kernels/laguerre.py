@@ -161,43 +161,9 @@ def _walked(i, y1, y2, psi, first, other, begin, x1, x2, phi, site):
         phi[i, j], site[i, j] = best, p
 
 
-def adjacency(triangles, sites):
-    """Neighbours of each of so many sites in a triangulation, triangles (k, 3) int32: those of p are other[first[p]..first[p + 1]],
-    ascending."""
-    first, other = np.zeros(sites + 1, np.int64), np.empty(6 * len(triangles), np.int32)
-    return first, other[: _adjacency(triangles, first, other)]
-
-
-@njit(entry=True, nogil=True)
-def _adjacency(triangles, first, other):
-    """Fills both; the number of entries: every inner edge is listed by two triangles, and kept once."""
-    n = len(first) - 1
-    for t in range(len(triangles)):
-        for k in range(3):
-            first[triangles[t, k] + 1] += 2
-    for p in range(n):
-        first[p + 1] += first[p]
-    fill = first[:-1].copy()
-    for t in range(len(triangles)):
-        for k in range(3):
-            p = triangles[t, k]
-            other[fill[p]], other[fill[p] + 1] = triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]
-            fill[p] += 2
-    used = 0
-    for p in range(n):
-        own = np.sort(other[first[p] : fill[p]])
-        first[p] = used
-        for k in range(len(own)):
-            if k == 0 or own[k] != own[k - 1]:
-                other[used] = own[k]
-                used += 1
-    first[n] = used
-    return used
-
-
 @njit(entry=True, nogil=True)
 def linked(first, other, sites):
-    """As of `borders`, of the first `sites` of those of an `adjacency`."""
+    """As of `borders`, of the first `sites` of those whose neighbours are given as for `walked`."""
     head, degree = np.full(sites, -1, np.int32), np.zeros(sites, np.int32)
     link, end = np.empty(len(other), np.int32), np.empty(len(other), np.int32)
     count = 0

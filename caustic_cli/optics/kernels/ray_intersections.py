@@ -144,20 +144,6 @@ def _stretch(o, d, first, last):
     return (first, last) if o >= 0.0 and o <= 1.0 else (np.inf, -np.inf)
 
 
-@njit(inline="always", **FAST)
-def enter_alone(ray, floor):
-    """o_u, o_v, o_z and the way of one ray, as of `enter`."""
-    ou, ov, oz, du, dv, dz = ray
-    first, last = _stretch(ou, du, 0.0, np.inf)
-    first, last = _stretch(ov, dv, first, last)
-    if not (first <= last and dz > 0.0):
-        return -1.0, ov, oz, 0.0
-    t = max(first, min((floor - oz) / dz, last))
-    if t > 0.0:
-        return min(max(ou + t * du, 0.0), 1.0), min(max(ov + t * dv, 0.0), 1.0), oz + t * dz, t
-    return ou, ov, oz, 0.0
-
-
 @njit(entry=True, **FAST)
 def enter(block, rays, floor, way, blocks):
     """Advance rays, (o_u, o_v, o_z, d_u, d_v, d_z), (N,) each, to their entry into the box, overwriting o; way (N,): the distance.
@@ -170,8 +156,16 @@ def enter(block, rays, floor, way, blocks):
     ou, ov, oz, du, dv, dz = rays
     count = len(ou)
     for k in range(block * count // blocks, (block + 1) * count // blocks):
-        ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
-        ou[k], ov[k], oz[k], way[k] = enter_alone(ray, floor)
+        first, last = _stretch(ou[k], du[k], 0.0, np.inf)
+        first, last = _stretch(ov[k], dv[k], first, last)
+        way[k] = 0.0
+        if not (first <= last and dz[k] > 0.0):
+            ou[k] = -1.0
+            continue
+        t = max(first, min((floor - oz[k]) / dz[k], last))
+        if t > 0.0:
+            ou[k], ov[k] = min(max(ou[k] + t * du[k], 0.0), 1.0), min(max(ov[k] + t * dv[k], 0.0), 1.0)
+            oz[k], way[k] = oz[k] + t * dz[k], t
 
 
 class _Hits(torch.autograd.Function):

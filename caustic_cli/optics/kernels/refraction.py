@@ -22,7 +22,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from caustic_cli.optics.kernels.fresnel import cosine_behind, reflectance
+from torch import Tensor
+
+from caustic_cli.optics.kernels.fresnel import FRESNEL, cosine_behind, reflectance
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.stage import RayStage, load, store, store_flags
 from caustic_cli.optics.tolerances import NORMAL
@@ -168,3 +170,27 @@ def _refract_adjoint(v, start, count, ray, surface, given, out):
 
 
 REFRACT = RayStage.of(_refract, _refract_adjoint, ROWS, 4)
+
+
+def interact(direction, slopes, power: Tensor, *, eta: float, fresnel: str, field=None):
+    """Direction and power behind a surface z(x, y).
+
+    Args:
+        direction: (d_x, d_y, d_z) of unit length, each a tensor (N,) float64 or a number for all rays.  It may run along the
+            surface's normal (-z_x, -z_y, 1) or against it.
+        slopes: (z_x, z_y) at the hits, (N,) float64.
+        power: (N,) float64.
+        eta: n_in / n_out.
+        fresnel: none, schlick or exact.
+        field: (E_x, E_y, E_z) of linearly polarised light, unit length, tensors or numbers; None for light without
+            polarisation.  Only exact Fresnel losses heed it.
+
+    Returns:
+        direction: three tensors (N,), finite but meaningless where light is totally reflected.
+        power: (N,), 0 where light is totally reflected.
+        passes: (N,) bool, False where it is.
+    """
+    polarised = field is not None and fresnel == "exact"
+    surface = Interface(float(eta), FRESNEL[fresnel], polarised)
+    *t, after, passes = REFRACT(surface, *direction, *slopes, power, *(field if polarised else (0.0, 0.0, 0.0)))
+    return tuple(t), after, passes

@@ -46,10 +46,10 @@ class Axis:
 
     def __init__(self, space: SplineSpace):
         breaks = space.breaks
-        middle, width = (breaks[1:] + breaks[:-1]) / 2.0, breaks[1:] - breaks[:-1]
-        self.space, self.first = space, space.basis(middle)[0].numpy()
-        rows = [space.basis(middle, a)[1] * (width**a / math.factorial(a))[:, None] for a in range(space.degree + 1)]
-        self.matrices = torch.stack(rows, 1).contiguous().numpy()
+        middle, width = (breaks[1:] + breaks[:-1]) / 2.0, breaks.diff()
+        first, values = space.bases(middle, range(space.degree + 1))
+        rows = [value * (width**a / math.factorial(a))[:, None] for a, value in values.items()]
+        self.space, self.first, self.matrices = space, first.numpy(), torch.stack(rows, 1).contiguous().numpy()
         self.geometry = (breaks.numpy(), middle.numpy(), (1.0 / width).numpy())
 
 

@@ -50,29 +50,6 @@ def _along(x, axis, out):
 
 
 @njit(inline="always", **FAST)
-def _slope(c, i, j, k, room, nu, nv, nw):
-    """n and grad n."""
-    bu, bv, bw = room
-    n, nx, ny, nz = 0.0, 0.0, 0.0, 0.0
-    for a in range(nu):
-        r, ry, rz = 0.0, 0.0, 0.0
-        for b in range(nv):
-            s, sz = 0.0, 0.0
-            for d in range(nw):
-                value = c[i + a, j + b, k + d]
-                s += value * bw[0, d]
-                sz += value * bw[1, d]
-            r += bv[0, b] * s
-            ry += bv[1, b] * s
-            rz += bv[0, b] * sz
-        n += bu[0, a] * r
-        nx += bu[1, a] * r
-        ny += bu[0, a] * ry
-        nz += bu[0, a] * rz
-    return n, nx, ny, nz
-
-
-@njit(inline="always", **FAST)
 def _curve(c, i, j, k, room, nu, nv, nw):
     """n, grad n and the six second derivatives."""
     bu, bv, bw = room
@@ -118,7 +95,7 @@ def _bases(axes, x, y, z, room):
 @njit(inline="always", **FAST)
 def _index(c, axes, x, y, z, room):
     i, j, k, nu, nv, nw = _bases(axes, x, y, z, room)
-    n, nx, ny, nz = _slope(c, i, j, k, room, nu, nv, nw)
+    n, nx, ny, nz, _, _, _, _, _, _ = _curve(c, i, j, k, room, nu, nv, nw)  # inlined: what is not used is not computed
     return n * n, n, n * nx, n * ny, n * nz
 
 

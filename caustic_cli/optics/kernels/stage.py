@@ -11,7 +11,6 @@ over them are vectorised without checks for overlap.  Everything is float64.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -87,19 +86,15 @@ def _arrays(value):
 
 
 class RayStage(NamedTuple):
-    """A stage: its batch functions, how many rows of scratch these use and how many results they have; its kernels, and how one is
-    run on tensors: (kernel, count, *arguments)."""
+    """A stage: the kernels of its batch functions, and how many results it has."""
 
-    batches: tuple
-    rows: int
-    outputs: int
     kernels: tuple
-    run: Callable[..., None]
+    outputs: int
 
     @classmethod
-    def of(cls, forward, adjoint, rows: int, outputs: int, kernel: Callable = _kernel, run: Callable = _run) -> RayStage:
-        """With kernels made of the batch functions by `kernel`."""
-        return cls((forward, adjoint), rows, outputs, (kernel(forward, rows), kernel(adjoint, rows)), run)
+    def of(cls, forward, adjoint, rows: int, outputs: int) -> RayStage:
+        """By its batch functions; rows: of scratch that these use."""
+        return cls((_kernel(forward, rows), _kernel(adjoint, rows)), outputs)
 
     def __call__(self, parameters: tuple, *ray: Tensor | float) -> tuple[Tensor, ...]:
         """Results (N,) of rays, each component a tensor (N,) or a number, and whether each goes on, (N,) bool.
@@ -109,17 +104,12 @@ class RayStage(NamedTuple):
         return _Applied.apply(self, parameters, *ray)
 
 
-def here(stage: RayStage) -> RayStage:
-    """The stage itself, which runs on the CPU: others may make one for another device of it."""
-    return stage
-
-
 class _Applied(torch.autograd.Function):
     @staticmethod
     def forward(stage: RayStage, parameters: tuple, *ray):
         like = _like(ray)
         out, flags = tuple(torch.empty_like(like) for _ in range(stage.outputs)), torch.empty_like(like, dtype=torch.bool)
-        stage.run(stage.kernels[0], len(like), _components(ray, like), parameters, (), (out, flags))
+        _run(stage.kernels[0], len(like), _components(ray, like), parameters, (), (out, flags))
         return *out, flags
 
     @staticmethod
@@ -136,7 +126,7 @@ class _Applied(torch.autograd.Function):
         ray = tuple(n if t is None else t for t, n in zip(ctx.saved_tensors, ctx.numbers, strict=True))
         like, wanted = _like(ray), ctx.needs_input_grad[2:]
         out = tuple(torch.empty_like(like) if w else like.new_empty(0) for w in wanted)
-        ctx.stage.run(ctx.stage.kernels[1], len(like), _components(ray, like), ctx.parameters, _components(by[:-1], like), out)
+        _run(ctx.stage.kernels[1], len(like), _components(ray, like), ctx.parameters, _components(by[:-1], like), out)
         return None, None, *(a if w else None for a, w in zip(out, wanted, strict=True))
 
 
@@ -151,10 +141,3 @@ def _components(values, like: Tensor) -> tuple[Tensor, ...]:
         v.detach().double().contiguous() if isinstance(v, Tensor) else like.new_full((1,), 0.0 if v is None else float(v))
         for v in values
     )
-
-
-def component(value: Tensor | float | None) -> np.ndarray:
-    """(N,) of a tensor, (1,) of a number; None stands for 0."""
-    if isinstance(value, Tensor):
-        return value.detach().contiguous().numpy()
-    return np.array([0.0 if value is None else value], np.float64)

@@ -84,11 +84,8 @@ class FusedSurface:
         return *(len(a.first) for a in self.axes), *(a.matrices.shape[1] for a in self.axes)
 
 
-def scattered_surface(surface, heights: Tensor, u, v) -> tuple[Tensor, Tensor, Tensor]:
-    """Heights (n, m) mm, points in [0, 1]^2 (N,) -> z mm, dz/dx, dz/dy (N,) float64, linear in the heights.
-
-    surface: a `FusedSurface`, or another that evaluates itself at the points as they are given, on its own device.
-    """
+def scattered_surface(surface: FusedSurface, heights: Tensor, u, v) -> tuple[Tensor, Tensor, Tensor]:
+    """Heights (n, m) mm, points in [0, 1]^2 (N,) -> z mm, dz/dx, dz/dy (N,) float64, linear in the heights."""
     return _ScatteredSurface.apply(heights, surface, u, v)
 
 

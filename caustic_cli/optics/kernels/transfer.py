@@ -16,7 +16,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import RayStage, here, load, store, store_flags
+from caustic_cli.optics.kernels.stage import RayStage, load, store, store_flags
 from caustic_cli.optics.tolerances import PARALLEL
 
 OX, OY, OZ, DX, DY, DZ, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY, BY_DZ, ROWS = range(16)
@@ -109,7 +109,7 @@ def _land_adjoint(v, start, count, ray, plane, given, out):
 LAND = RayStage.of(_land, _land_adjoint, ROWS, 2)
 
 
-def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float, *, on=here):
+def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float):
     """Intersections of rays with a plane.
 
     Args:
@@ -117,11 +117,10 @@ def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], 
         point: of the plane, where its coordinates are 0.
         axes: unit vectors along its x and y, and its normal.
         forward: 1 for rays that arrive with d . normal > 0, -1 for those that arrive against it.
-        on: what makes the stage one of the rays' device.
 
     Returns:
         x, y: (N,) in the plane; of rays that are not on their way to it those of their origin, and meaningless.
         on_way: (N,) bool.
     """
     plane = TargetPlane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
-    return on(LAND)(plane, *origin, *direction)
+    return LAND(plane, *origin, *direction)

@@ -82,24 +82,22 @@ class HeightField(Surface[Tensor]):
                     )
                 )
             )
-        i, bu = su.basis(sample.u)
-        j, bv = sv.basis(sample.v)
-        du, dv = su.basis(sample.u, 1)[1] / (2 * rx), sv.basis(sample.v, 1)[1] / (2 * ry)
-        return _ScatteredEvaluator(i * sv.n + j, sv.n, *(b.to(dtype) for b in (bu, du, bv, dv)))
+        (i, bu), (j, bv) = su.bases(sample.u, (0, 1)), sv.bases(sample.v, (0, 1))
+        return _ScatteredEvaluator(i * sv.n + j, sv.n, *(b.to(dtype) for b in (bu[0], bu[1] / (2 * rx), bv[0], bv[1] / (2 * ry))))
 
     def at(self, heights: Tensor, x: Tensor, y: Tensor, orders: Sequence[tuple[int, int]] = FIRST) -> list[Tensor]:
         """Derivatives of these orders by x and y at points (N,) mm, each (N,) float64, mm^(1 - a - b); linear in the heights."""
         (su, sv), (rx, ry), flat = self.spaces, self.half_size, heights.double().reshape(-1)
         u, v = 0.5 * (x / rx + 1.0), 0.5 * (y / ry + 1.0)
-        bu, bv = ({k: s.basis(c, k) for k in {order[d] for order in orders}} for d, s, c in ((0, su, u), (1, sv, v)))
-        corner = bu[orders[0][0]][0] * sv.n + bv[orders[0][1]][0]
+        (i, bu), (j, bv) = (s.bases(c, {order[d] for order in orders}) for d, s, c in ((0, su, u), (1, sv, v)))
+        corner = i * sv.n + j
         columns = torch.arange(sv.degree + 1, device=flat.device)
         totals: list[Tensor | float] = [0.0] * len(orders)
         for k in range(su.degree + 1):  # one row of the local net at a time bounds the memory
             at = (corner + k * sv.n)[:, None] + columns
             row = flat.index_select(0, at.reshape(-1)).view(at.shape)
-            along = {b: (row * basis).sum(1) for b, (_, basis) in bv.items()}
-            totals = [total + bu[a][1][:, k] * along[b] for total, (a, b) in zip(totals, orders, strict=True)]
+            along = {b: (row * basis).sum(1) for b, basis in bv.items()}
+            totals = [total + bu[a][:, k] * along[b] for total, (a, b) in zip(totals, orders, strict=True)]
         return [cast(Tensor, t) / ((2.0 * rx) ** a * (2.0 * ry) ** b) for t, (a, b) in zip(totals, orders, strict=True)]
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
