@@ -1,6 +1,6 @@
 """Fits the models of `caustic design --plan` to measured designs, and judges them by pictures left out.
 
-    python tests/benchmarks/plan.py measure DIRECTORY [NAME ...]      designs of the pictures (all), an hour; DIRECTORY/designs.jsonl
+    python tests/benchmarks/plan.py measure DIRECTORY [NAME ...]      designs, an hour for all pictures; DIRECTORY/designs.jsonl
     python tests/benchmarks/plan.py fit DIRECTORY                     constants of caustic_cli/workflow/estimate.py, judged
     python tests/benchmarks/plan.py judge DIRECTORY                   the constants as they are, judged
 
