@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +19,8 @@ from helpers import begun
 from PIL import Image
 
 from caustic_cli import cli
-from caustic_cli.kinds import surface
+from caustic_cli.inverse.designer import State
+from caustic_cli.kinds import evaluation, surface
 from caustic_cli.project import checkpoint
 from caustic_cli.workflow import design as workflow
 
@@ -231,6 +234,28 @@ def test_a_design_improves_the_picture(capfd, kind):
     assert last["relative_rms"] < 0.5 * first["relative_rms"]
     assert last["on_screen"] > 0.85  # the rest is reflected at the two surfaces
     assert last["ssim"] > first["ssim"] and last["psnr_db"] > first["psnr_db"]
+
+
+@pytest.mark.parametrize("seen", ["nothing", "a wave image"])
+def test_a_lens_that_lost_its_wave_image_is_not_compared_by_rays(seen):
+    """Rays of a lens refined for waves say nothing of it: without its wave image its start, which has one, is kept."""
+    light, rays = SimpleNamespace(halves=None), {"relative_rms": 0.3, "on_screen": 0.9, "noise": None}
+    start = rays | {"wave_relative_rms": 0.2, "wave_on_screen": 0.9}
+    state = State(heights=torch.ones(4, 4), start=torch.zeros(4, 4), reason="iterations")
+    options, source = SimpleNamespace(loss="rms"), SimpleNamespace(parallel=True)
+    found = object.__new__(evaluation.LensEvaluation)
+    found.problem = SimpleNamespace(options=options, scene=SimpleNamespace(source=source), feasible=lambda _, z: z)
+    found.designer = SimpleNamespace(initial_surface=lambda s: s.start, showing=lambda s, z: replace(s, heights=z), stages=[])
+    found.refined, found.state = True, state
+    found.rays, found.see = lambda z, noise=True: (None, rays), lambda *_: evaluation.Seen(None, light, start)
+    found.light = light if seen == "a wave image" else None
+    waves = {"wave_relative_rms": 0.1} if found.light else {"wave_relative_rms": None, "no_wave_image": "rays cross"}
+    found.figures = rays | {"relative_rms": 0.1, "wave_on_screen": 0.9} | waves
+    found.compare_with_start()
+    kept = torch.equal(found.state.heights, state.start)
+    assert kept == (seen == "nothing") and found.figures["wave_relative_rms"] == (0.2 if kept else 0.1)
+    said = "iterations; it has no wave image any more, and its start is kept: rays cross"
+    assert found.state.reason == (said if kept else "iterations")
 
 
 def test_a_design_is_never_worse_than_its_start(capfd):

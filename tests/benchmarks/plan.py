@@ -1,6 +1,6 @@
 """Fits the models of `caustic design --plan` to measured designs, and judges them by pictures left out.
 
-    python tests/benchmarks/plan.py measure DIRECTORY [PICTURE ...]   designs, an hour for fifteen pictures; DIRECTORY/designs.jsonl
+    python tests/benchmarks/plan.py measure DIRECTORY [NAME ...]      designs, an hour for all pictures; DIRECTORY/designs.jsonl
     python tests/benchmarks/plan.py fit DIRECTORY                     constants of caustic_cli/workflow/estimate.py, judged
     python tests/benchmarks/plan.py judge DIRECTORY                   the constants as they are, judged
 
@@ -8,6 +8,7 @@ Designs are measured one after the other on an otherwise idle machine; a design 
 """
 
 import argparse
+import gzip
 import json
 import subprocess
 import sys
@@ -15,6 +16,10 @@ import time
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
+from quality import DATA, EXAMPLES
+from quality import pictures as photographs
+from scipy.ndimage import gaussian_filter
 from scipy.optimize import nnls
 
 from caustic_cli.config.wave_stages import transform_samples
@@ -35,11 +40,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=("measure", "fit", "judge"))
     parser.add_argument("directory", type=Path)
-    parser.add_argument("pictures", type=Path, nargs="*")
+    parser.add_argument("names", nargs="*")
     asked = parser.parse_args()
     task, place = asked.task, asked.directory
     if task == "measure":
-        measure(place, [p.absolute() for p in asked.pictures])
+        known = pictures(place)
+        measure(place, [known[name] for name in asked.names or known])
         return
     rows = [json.loads(line) for line in (place / RESULTS).read_text().splitlines()]
     cases = [case(row) for row in rows]
@@ -48,6 +54,29 @@ def main() -> None:
         fit_seconds(cases)
         fit_memory(cases)
     judge(cases)
+
+
+def pictures(folder: Path) -> dict[str, Path]:
+    """Name -> file of the pictures: those of `quality.py`, of examples/, and such as have no photograph's spectrum."""
+    folder.mkdir(parents=True, exist_ok=True)
+    u, v = np.meshgrid(np.linspace(-1, 1, 200), np.linspace(-1, 1, 200))
+    generator = np.random.default_rng(0)
+    with gzip.open(DATA / "sample_data/s1045.ima.gz") as file:
+        scan = np.frombuffer(file.read(), np.uint16)
+    made = {
+        "rings": 0.5 + 0.5 * np.cos(40 * np.hypot(u, v) ** 1.5),
+        "clouds": gaussian_filter(generator.random((200, 200)), 8, mode="wrap"),
+        "stars": gaussian_filter((generator.random((200, 200)) > 0.998).astype(float), 1.2),
+        "chequers": (np.floor(8 * u) + np.floor(8 * v)) % 2,
+        "head": scan.reshape(256, 256).astype(float),
+        "mountains": np.load(DATA / "sample_data/jacksboro_fault_dem.npz")["elevation"].astype(float),
+        "disc": (np.hypot(u, v) < 0.7).astype(float),
+    }
+    for name, values in made.items():
+        values = (values - values.min()) / np.ptp(values)
+        Image.fromarray((255 * values).round().astype(np.uint8)).save(folder / f"{name}.png")
+    known = photographs(folder) | {name: EXAMPLES / f"{name}.png" for name in ("tophat", "house")}
+    return known | {name: folder / f"{name}.png" for name in made}
 
 
 def measure(place: Path, pictures: list[Path]) -> None:
@@ -63,14 +92,13 @@ def measure(place: Path, pictures: list[Path]) -> None:
         settings = ["--mag", "3", "--quality", quality, "--waves", waves, *options]
         command = [sys.executable, "-m", "caustic_cli", "design", str(picture), *settings, "-o", str(place / name), "--force"]
         slow, began = estimate.measured_slowness(), time.monotonic()
-        timed = ["/usr/bin/time", "-f", "%M", *command, "--json", "--quiet"]
+        timed = ["/usr/bin/time", "-f", "%U %S %M", *command, "--json", "--quiet"]
         found = subprocess.run(timed, capture_output=True, text=True, check=True)
         row = {"name": name, "picture": picture.stem, "quality": quality, "wall": time.monotonic() - began, "slow": slow}
         figures = json.loads(found.stdout)
-        row |= {key: figures[key] for key in ("error", "error_by")} | {
-            "rss": int(found.stderr.split()[-1]),
-            "dir": str(place / name),
-        }
+        user, system, most = found.stderr.split()[-3:]
+        row |= {key: figures[key] for key in ("error", "error_by")}
+        row |= {"processor": float(user) + float(system), "rss": int(most), "dir": str(place / name)}
         with (place / RESULTS).open("a") as file:
             file.write(json.dumps(row) + "\n")
 
