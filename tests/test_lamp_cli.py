@@ -303,7 +303,9 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
         (["export", "--format", "ies", "--samples", "9"], "--samples belongs to stl, ply, obj, 3mf"),
         (["export", "--format", "stl", "--samples", "1"], "2 to 4000 rings"),
         (["export", "--format", "stl,ply", "-o", "a.stl"], "--out names one file"),
-        (["gradmap", "--control", "3,3"], "makes a lamp"),
+        (["gradmap", "--reconstruction", "bincount"], "the derivative of an image needs gaussian or cosine"),
+        (["gradmap", "--control", "3,99"], "--control must be I,J"),
+        (["gradmap", "--at", "throw=300"], "--at is for a lens before its light"),
         (["convergence"], "makes a lamp"),
         (["design", "--resume", "--iterations", "9"], "--iterations is for a lens before its light"),
         (["design", "--resume", "--movie", "a.gif"], "--movie is for a lens before its light"),
@@ -513,3 +515,13 @@ def test_the_values_of_a_checkpoint_are_those_of_r(road):
     assert lamp.lamp.inner + lamp.lamp.wall < least < greatest < 16.0
     x, y, z = lamp.field.points(lamp.values, torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
     assert float(x) == float(y) == 0.0 and least <= float(z) <= greatest
+
+
+def test_a_map_of_the_derivative_agrees_with_central_differences(road, capfd):
+    asked = ["gradmap", str(road), "--rays", "1e5", "--check", "-o", "map.png", "--npy", "map.npy"]
+    (found,) = figures_of(capfd, *asked)["maps"]
+    change = np.load("map.npy")
+    assert found["control"] == [9, 9] and found["check"]["relative_error"] < 1e-6
+    lit = np.argwhere(change != 0)
+    assert 10 < len(lit) < change.size  # under the basis function alone
+    assert abs(found["sum"]) < 1e-2 * np.abs(change).sum()  # light is moved, and a little of it reflected
