@@ -103,7 +103,7 @@ class Effort:
     lamp_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 20_000, 100, 0.1),
         (6_000, 60_000, 150, 0.03),
-        (24_000, 250_000, 500, 0.007),
+        (24_000, 500_000, 400, 0.008),
     )
     #: The same for two free-form surfaces, after the first of the stages above with one.
     two_stages: tuple[tuple[int, int, int, float], ...] = (
