@@ -103,13 +103,13 @@ class Effort:
     lamp_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 20_000, 100, 0.1),
         (6_000, 60_000, 150, 0.03),
-        (24_000, 250_000, 250, 0.01),
+        (24_000, 500_000, 400, 0.008),
     )
     #: The same for two free-form surfaces, after the first of the stages above with one.
     two_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 30_000, 150, 0.2),
         (6_000, 60_000, 80, 0.03),
-        (24_000, 250_000, 110, 0.015),
+        (24_000, 250_000, 150, 0.012),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.
     chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_100, 300_000, 90, 0.045),)

@@ -204,7 +204,7 @@ def test_plot_shows_the_screen_from_behind_and_repeats_byte_for_byte(tmp_path):
     gradient = torch.zeros(4, 4, dtype=torch.float64)
     gradient[3, 0] = 1e-3  # +x, -y: the lower right corner
     for name in ("a.png", "b.png"):
-        plot_gradient(tmp_path / name, gradient, scene, "one pixel")
+        plot_gradient(tmp_path / name, gradient, scene.screen, "one pixel")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "b.png"]
     rgb = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
@@ -230,6 +230,6 @@ def test_a_plot_shows_what_is_not_zero():
 
 def test_plot_of_nothing_is_a_plot(tmp_path):
     scene = Scene(PlaneWave(), Lens(), Screen((4.0, 2.0), 300.0, (4, 2)))
-    plot_gradient(tmp_path / "zero.png", torch.zeros(4, 2), scene, "all zero")
+    plot_gradient(tmp_path / "zero.png", torch.zeros(4, 2), scene.screen, "all zero")
     with Image.open(tmp_path / "zero.png") as image:
         assert image.size[0] > 100

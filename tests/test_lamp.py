@@ -13,11 +13,13 @@ from scipy.spatial import cKDTree
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lamp import (
+    APRON,
     Folds,
     LampObjective,
     design_lamp,
     directions_of,
     field_of,
+    finely,
     judged_pixels,
     pixels_of,
     refined,
@@ -476,12 +478,23 @@ def test_a_lamp_is_judged_on_pixels_half_as_wide_as_those_refined():
         assert judged_pixels(lamp, goal, STANDARD) == (2 * across, 2 * along)
 
 
+def test_pixels_along_the_edges_are_half_as_wide():
+    """All light of the screen is compared once, and the loss is the squared relative error on pixels of either width."""
+    goal = Goal((80.0, 40.0))
+    one = LampObjective(Lamp(), goal, FIELD, wanted(goal, np.ones((2, 2)), (40, 20)), 3000)
+    wide, fine = one.coarse_weights > 0, one.fine_weights > 0
+    assert bool((finely(wide.double()).bool() ^ fine).all())
+    assert wide[APRON:-APRON, APRON:-APRON].nonzero().tolist() == [[i, j] for i in range(3, 17) for j in range(3, 7)]
+    assert wide.sum() == 14 * 4 and float(one.coarse_weights.max()) == 20 * 10 and float(one.fine_weights.max()) == 40 * 20
+
+
 def test_the_edges_that_a_chip_blurs_count_little():
     goal = Goal((80.0, 40.0))
-    target = wanted(goal, np.ones((2, 2)), (20, 10))
-    one, other = (LampObjective(Lamp(chip), goal, FIELD, target, 3000) for chip in (Chip(), Chip("disc", (0.5, 0.5))))
-    assert float(one.weights.min()) == 1.0 and float(other.weights.min()) < 0.02
-    assert float((other.weights == 1.0).sum()) == (20 - 2) * (10 - 2)  # less 3.8 degrees, a pixel of 4, at every edge
+    target = wanted(goal, np.ones((2, 2)), (40, 20))
+    other = LampObjective(Lamp(Chip("disc", (0.5, 0.5))), goal, FIELD, target, 3000)
+    counted = other.coarse_weights / other.coarse_weights.max()
+    assert not other.fine_weights.any() and 0 < float(counted.min()) < 0.02
+    assert float((counted == 1.0).sum()) == (20 - 2) * (10 - 2)  # less 3.8 degrees, a pixel of 4, at every edge
     assert float((other.target * other.seen).sum()) == pytest.approx(1.0) and float(other.target.sum()) > 1.2
 
 

@@ -16,11 +16,12 @@ from caustic_cli.export.lamp_mitsuba import plane_of, write_lamp_mitsuba
 from caustic_cli.export.lamp_step import write_lamp_step
 from caustic_cli.io.photometry import read_photometry
 from caustic_cli.optics.lamp import LampLight, emissions, through
-from caustic_cli.optics.lamp_array import among, meets_neighbour
+from caustic_cli.optics.lamp_array import among, clear_pitch, meets_neighbour
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.studies.lamp import lamp_image
 from caustic_cli.studies.lamp_verify import _emitted, verify_lamp
+from caustic_cli.workflow.lamp import warnings
 
 FIELD = PolarField.uniform((12, 9), (3, 4))
 NOISE = torch.randn(FIELD.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -194,3 +195,27 @@ def test_an_array_that_is_none_is_refused_in_one_line(options, words, tmp_path, 
     assert cli.run(["design", "uniform", "--lamp", "15", "--angles", "60", *options, "--quiet"]) == 2
     (line,) = capfd.readouterr().err.splitlines()
     assert words in line and not list(Path().iterdir())
+
+
+def test_beyond_the_clear_pitch_all_light_for_the_picture_passes():
+    goal, lamp = Goal((30e3, 10e3), 8e3, (0.0, 2e3)), Lamp()
+    turn = torch.linspace(-0.5 * math.pi, 0.5 * math.pi, 4001, dtype=torch.float64)
+    outer = FIELD.sphere(lamp.radius)
+    for axis, tangent in ((0, 15.0 / 8.0), (1, 7.0 / 8.0)):
+        d, zero = [torch.zeros_like(turn), torch.zeros_like(turn), torch.full_like(turn, math.cos(math.atan(tangent)))], 0.0 * turn
+        d[axis] = torch.full_like(turn, math.sin(math.atan(tangent)))
+        point = [zero, zero, lamp.radius * torch.cos(turn)]
+        point[axis] = lamp.radius * torch.sin(turn)
+        light = LampLight(tuple(point), tuple(d), torch.ones_like(turn), {}, zero)
+        pitch = clear_pitch(lamp, goal)[axis]
+        for scale, blocked in ((1.001, False), (0.99, True)):
+            array = Lamp(base=2.0, array=(2, 2), pitch=(scale * pitch,) * 2)
+            found = meets_neighbour(array, FIELD, outer, light, torch.zeros(len(turn), dtype=torch.long))
+            assert bool(found.any()) is blocked
+
+
+def test_shadows_of_neighbours_are_told_in_one_line():
+    lamp, goal = Lamp(base=2.0, array=(4, 4), pitch=(32.0, 32.0)), Goal((30e3, 10e3), 8e3)
+    (words,) = warnings(lamp, goal, {"lost": {"neighbours": 0.013}})
+    assert "1.3% of the light meets the lens of a neighbour" in words and "47 x 33 mm" in words
+    assert not [*warnings(lamp, goal, {"lost": {"neighbours": 0.0007}}), *warnings(lamp, goal, {"lost": {}})]

@@ -296,14 +296,16 @@ def test_a_design_that_is_none_is_refused_in_one_line(given, words, capfd):
         (["export"], "a --format is needed"),
         (["export", "-o", "a.dat"], "a --format is needed"),
         (["export", "--format", "heightmap"], "a lamp's surface is none of that"),
-        (["export", "--format", "zemax"], "step as a solid for LightTools and OpticStudio"),
+        (["export", "--format", "phase"], "step and lighttools as a solid, zemax as a Polygon Object"),
         (["export", "--format", "step", "--samples", "9"], "--samples belongs to stl, ply, obj, 3mf"),
         (["export", "--format", "gcode"], "a lamp's surface is none of that"),
         (["export", "--format", "stl", "--mould"], "--mould is for a lens before its light"),
         (["export", "--format", "ies", "--samples", "9"], "--samples belongs to stl, ply, obj, 3mf"),
         (["export", "--format", "stl", "--samples", "1"], "2 to 4000 rings"),
         (["export", "--format", "stl,ply", "-o", "a.stl"], "--out names one file"),
-        (["gradmap", "--control", "3,3"], "makes a lamp"),
+        (["gradmap", "--reconstruction", "bincount"], "the derivative of an image needs gaussian or cosine"),
+        (["gradmap", "--control", "3,99"], "--control must be I,J"),
+        (["gradmap", "--at", "throw=300"], "--at is for a lens before its light"),
         (["convergence"], "makes a lamp"),
         (["design", "--resume", "--iterations", "9"], "--iterations is for a lens before its light"),
         (["design", "--resume", "--movie", "a.gif"], "--movie is for a lens before its light"),
@@ -361,6 +363,28 @@ def test_solids_are_written_and_repeated(format, road, capfd):
         assert int.from_bytes(first[80:84], "little") == 2 * (60 + 19 * 120) + 120
     if format == "obj":
         assert first.count(b"\nv ") == 2 * (1 + 20 * 60)
+
+
+def test_a_polygon_object_is_a_closed_solid_with_a_group_for_each_surface(road, capfd):
+    figures = figures_of(capfd, "export", str(road), "--format", "zemax", "--samples", "20x60")
+    comment, *lines = Path(figures["file"]).read_text().splitlines()
+    assert figures["file"].endswith(".pob") and comment.startswith("!") and "0 inner surface, 1 outer surface, 2 foot" in comment
+    vertices = np.array([line.split()[1:] for line in lines if line[0] == "V"], dtype=float)
+    triangles = np.array([line.split()[1:] for line in lines if line[0] == "T"], dtype=int)
+    assert len(vertices) + len(triangles) == len(lines) and list(vertices[:, 0]) == list(range(1, len(vertices) + 1))
+    faces, (kind, group) = triangles[:, :3] - 1, triangles[:, 3:].T
+    ways = [tuple(way) for way in np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()]
+    assert len(set(ways)) == len(ways) and {(b, a) for a, b in ways} == set(ways)
+    assert not kind.any() and set(group) == {0, 1, 2}
+    inner = np.linalg.norm(vertices[np.unique(faces[group == 0]), 1:], axis=1)
+    assert inner == pytest.approx(4.0, abs=1e-6)  # the hemisphere
+
+
+def test_lighttools_has_the_step_file(road, capfd):
+    for name in ("step", "lighttools"):
+        figures_of(capfd, "export", str(road), "--format", name, "-o", f"{name}.step")
+    one, other = (Path(f"{name}.step").read_text().split("DATA;")[1] for name in ("step", "lighttools"))
+    assert one == other
 
 
 def test_a_foot_is_part_of_the_solid_and_a_step_file_is_repeated(road, capfd):
@@ -513,3 +537,13 @@ def test_the_values_of_a_checkpoint_are_those_of_r(road):
     assert lamp.lamp.inner + lamp.lamp.wall < least < greatest < 16.0
     x, y, z = lamp.field.points(lamp.values, torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
     assert float(x) == float(y) == 0.0 and least <= float(z) <= greatest
+
+
+def test_a_map_of_the_derivative_agrees_with_central_differences(road, capfd):
+    asked = ["gradmap", str(road), "--rays", "1e5", "--check", "-o", "map.png", "--npy", "map.npy"]
+    (found,) = figures_of(capfd, *asked)["maps"]
+    change = np.load("map.npy")
+    assert found["control"] == [9, 9] and found["check"]["relative_error"] < 1e-6
+    lit = np.argwhere(change != 0)
+    assert 10 < len(lit) < change.size  # under the basis function alone
+    assert abs(found["sum"]) < 1e-2 * np.abs(change).sum()  # light is moved, and a little of it reflected

@@ -11,7 +11,7 @@ from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lamp import directions_of, pixels_of
 from caustic_cli.io.photometry import Photometry, read_photometry, write_ies, write_ldt
-from caustic_cli.project.photometric_target import angles_of, picture_of
+from caustic_cli.project.photometric_target import PIXELS, angles_of, picture_of
 from caustic_cli.scene.lamp import Goal
 
 PLANES, ANGLES = 15.0 * np.arange(24), 5.0 * np.arange(37)
@@ -177,7 +177,7 @@ def test_pictures_are_intensities_far_away_and_irradiance_on_a_plane():
     far, near = Goal((100.0, 60.0)), Goal((4000.0, 2000.0), 2000.0)
     for goal in (far, near):
         found = picture_of(light, goal)
-        d = directions_of(goal, pixels_of(goal, 60_000)).numpy()
+        d = directions_of(goal, pixels_of(goal, PIXELS)).numpy()
         plane, gamma = np.degrees(np.arctan2(d[:, 1], d[:, 0])), np.degrees(np.arccos(d[:, 2]))
         wanted = lopsided(plane, gamma) * (1.0 if goal is far else d[:, 2] ** 3)
         np.testing.assert_allclose(found.reshape(-1), wanted, rtol=3e-3, atol=0.05)

@@ -46,8 +46,8 @@ class ExportOptions(options.OfDesign, options.Debugging):
             "--format",
             metavar="NAME[,NAME...]",
             help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items())
-            + "; of a lamp step, stl, ply, obj, 3mf, mitsuba, ies (.ies, LM-63) and ldt (.ldt, EULUMDAT).  [default: what --out's"
-            " suffix says; lighttools]",
+            + "; of a lamp step, stl, ply, obj, 3mf, mitsuba, zemax (.pob, a Polygon Object), lighttools (.step), ies (.ies, LM-63)"
+            " and ldt (.ldt, EULUMDAT).  [default: what --out's suffix says; lighttools]",
         ),
     ] = None
     output: Annotated[

@@ -20,6 +20,10 @@ EXAMPLES = """Examples:
 """
 
 
+#: Options that apply to lamps.
+OF_LAMPS = ("control", "rays", "reconstruction", "filter_size", "alpha", "check", "output", "npy")
+
+
 class GradmapOptions(options.OfDesign, options.OnDevice):
     """Arguments and options of caustic gradmap."""
 
@@ -27,7 +31,9 @@ class GradmapOptions(options.OfDesign, options.OnDevice):
     control: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="I,J", help="Control point, counted from 0 at the -x, -y corner; may be repeated.  [default: the middle one]"
+            metavar="I,J",
+            help="Control point, counted from 0 at the -x, -y corner, of a lamp that of the radius of the outer surface; may be"
+            " repeated.  [default: the middle one]",
         ),
     ] = None
     rays: Annotated[str, typer.Option(metavar="N", help="Number of rays.")] = "1000000"
@@ -58,36 +64,28 @@ def run(asked: GradmapOptions) -> None:
     options.require_project(asked.project)
     device = asked.start_torch()
 
-    from caustic_cli.config.design import filter_from  # noqa: PLC0415
+    from caustic_cli.config.lamp import says_lamp  # noqa: PLC0415
     from caustic_cli.io.picture import write_npy  # noqa: PLC0415
-    from caustic_cli.project.project import Project  # noqa: PLC0415
-    from caustic_cli.studies import gradmap  # noqa: PLC0415
-    from caustic_cli.studies.retrace import sampler_for  # noqa: PLC0415
-    from caustic_cli.workflow.compilation import compile_for  # noqa: PLC0415
+    from caustic_cli.studies.gradmap import plot_gradient  # noqa: PLC0415
+    from caustic_cli.workflow.derivatives import OfLamp, OfLens  # noqa: PLC0415
 
-    opened = Project.open(asked.project).at(asked.at)
-    scene, field, heights, _ = opened.lens(opened.scene())
-    points = points or [(field.shape[0] // 2, field.shape[1] // 2)]
-    for i, j in points:
-        if not (0 <= i < field.shape[0] and 0 <= j < field.shape[1]):
-            raise InputError(f"--control must be I,J with I 0 to {field.shape[0] - 1} and J 0 to {field.shape[1] - 1}, got {i},{j}")
-    files = _files(asked, points)
     options.refuse_alpha(asked.alpha, asked.reconstruction)
-    filter = filter_from(asked.reconstruction, size, scene.screen, asked.alpha)
-    sampler = sampler_for(scene, count, opened.settings.design.seed if asked.seed is None else asked.seed, device)
-    compile_for(scene, device, say)
+    how = (asked.project, count, asked.seed, asked.reconstruction, size, asked.alpha)
+    if says_lamp(asked.project):
+        options.refuse_others(asked, OF_LAMPS)
+        derivative: OfLamp | OfLens = OfLamp.of(*how)
+    else:
+        derivative = OfLens.of(*how, at=asked.at, device=device, dtype=options.dtype_of(asked.dtype or "float64"), say=say)
+    shape = derivative.shape
+    points = points or [(shape[0] // 2, shape[1] // 2)]
+    for i, j in points:
+        if not (0 <= i < shape[0] and 0 <= j < shape[1]):
+            raise InputError(f"--control must be I,J with I 0 to {shape[0] - 1} and J 0 to {shape[1] - 1}, got {i},{j}")
     maps = []
-    for point, (image, npy) in zip(points, files, strict=True):
-        gradient = gradmap.gradient_image(
-            scene,
-            field,
-            heights,
-            point,
-            sampler=sampler,
-            filter=filter,
-            dtype=options.dtype_of(asked.dtype or "float64"),
-        )
-        gradmap.plot_gradient(image, gradient, scene, f"derivative with respect to control height {point[0]}, {point[1]}")
+    for point, (image, npy) in zip(points, _files(asked, points), strict=True):
+        gradient = derivative.image(point)
+        title = f"derivative with respect to control height {point[0]}, {point[1]}"
+        plot_gradient(image, gradient, derivative.screen, title, derivative.unit)
         if npy is not None:
             write_npy(npy, gradient.cpu().numpy())
         found: dict[str, Any] = {
@@ -98,11 +96,11 @@ def run(asked: GradmapOptions) -> None:
             "npy": None if npy is None else str(npy),
         }
         if asked.check:
-            found["check"] = asdict(gradmap.compare(gradient, scene, field, heights, point, sampler=sampler, filter=filter))
+            found["check"] = asdict(derivative.compared(gradient, point))
         maps.append(found)
         say.table(f"control point {point[0]}, {point[1]}", _rows(found))
     if asked.json:
-        console.emit_json({"maps": maps, "rays": sampler.count, "seconds": time.monotonic() - began})
+        console.emit_json({"maps": maps, "rays": derivative.rays, "seconds": time.monotonic() - began})
 
 
 def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:

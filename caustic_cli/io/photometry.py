@@ -4,6 +4,9 @@ Both hold intensities (planes, angles) at C and gamma, degrees.  EULUMDAT's are 
 candela for the lumens per lamp that the file names.  Dimensions are of the luminous opening: metres in LM-63, millimetres in
 EULUMDAT.
 
+Both are text of a few fields.  No library reads and writes them here: `eulumdat` of PyPI is compiled from Rust, and a machine for
+which it has no wheel could not install this program.  Other readers are the oracle in tests.
+
 LM-63 repeats the plane 0 at 360 degrees where there is no symmetry, EULUMDAT does not.
 """
 

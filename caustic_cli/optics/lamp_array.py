@@ -6,6 +6,7 @@ Light that meets the lens of another lamp is booked as lost to `neighbours`: whe
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import torch
@@ -13,10 +14,23 @@ from torch import Tensor
 
 from caustic_cli.optics.lamp import LampLight, sides
 from caustic_cli.optics.surfaces.polarfield import PolarField, Vectors, stereographic
-from caustic_cli.scene.lamp import Lamp
+from caustic_cli.scene.lamp import Goal, Lamp
 
 #: Points of a ray within the ball around a neighbour at which it is tested against its surface.
 PROBES = 32
+#: Largest angle from the axis for which a distance is given, degrees.
+STEEPEST = 85.0
+
+
+def clear_pitch(lamp: Lamp, goal: Goal) -> tuple[float, float]:
+    """Distances of lamps along x and y, mm, at which all light for the target passes the neighbours.
+
+    Of the light that leaves the upper half of a ball of radius R at an angle t from the axis, that of the rim passes R cos t below
+    its centre; the ball around a neighbour at the distance p reaches up to p cos t - R below it: p = R (1 + 1 / cos t).
+    """
+    tangents = [math.tan(math.radians(min(0.5 * a, STEEPEST))) for a in goal.angles] if goal.far else goal.slopes
+    across, along = (lamp.radius * (1.0 + math.hypot(1.0, t)) for t in tangents)
+    return across, along
 
 
 def among(lamp: Lamp, field: PolarField, values: Tensor, light: LampLight, rng: np.random.Generator) -> LampLight:

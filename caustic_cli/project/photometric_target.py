@@ -17,7 +17,7 @@ from caustic_cli.scene import anglemap
 from caustic_cli.scene.lamp import Goal
 
 #: Pixels of the picture, and part of the greatest intensity that counts as light.
-PIXELS, DARK = 60_000, 0.005
+PIXELS, DARK = 240_000, 0.005
 #: Steps between the angles of a file, an odd number, and iterations towards its values as means over cells.
 FINER, ROUNDS = 7, 8
 

@@ -189,6 +189,12 @@ class Goal:
         return math.degrees(math.atan(reach / self.distance))
 
     @property
+    def slopes(self) -> tuple[float, float]:
+        """Largest tangents along x and along y of the angles of a plane target's light to the axis."""
+        across, along = ((s / 2 + abs(c)) / self.distance for c, s in zip(self.shift, self.size, strict=True))
+        return across, along
+
+    @property
     def unit(self) -> str:
         """Of its size."""
         return "degrees" if self.far else "mm"

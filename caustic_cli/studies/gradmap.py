@@ -84,12 +84,7 @@ def gradient_image(
     """
     DERIVATIVE.refuse(scene)
     direction = _direction(field, control).to(sampler.device)
-    if min(filter.reach) < 1:
-        raise InputError(
-            "the derivative of an image needs gaussian or cosine reconstruction with a filter size of 3 or"
-            f" more along both axes, got {filter.kind} of size {filter.size[0]} x {filter.size[1]}, under"
-            " which no pixel changes when a ray moves a little"
-        )
+    refuse_steps(filter)
     heights = heights.detach().to(sampler.device, torch.float64)
     total = torch.zeros(scene.screen.resolution, dtype=torch.float64, device=sampler.device)
     for band in scene.bands:
@@ -103,6 +98,20 @@ def gradient_image(
                 image = traced.expose({EXIT: forward_ad.make_dual(heights, direction)}, scene.screen, filter).image
                 total += band.weight * forward_ad.unpack_dual(image).tangent.double()
     return total
+
+
+def refuse_steps(filter: Filter) -> None:
+    """Refuse a filter without a derivative.
+
+    Raises:
+        InputError: it is one.
+    """
+    if min(filter.reach) < 1:
+        raise InputError(
+            "the derivative of an image needs gaussian or cosine reconstruction with a filter size of 3 or"
+            f" more along both axes, got {filter.kind} of size {filter.size[0]} x {filter.size[1]}, under"
+            " which no pixel changes when a ray moves a little"
+        )
 
 
 def difference_step(scene: Scene, field: HeightField, control: tuple[int, int], pixels: float = DIFFERENCE_PIXELS) -> float:
@@ -191,8 +200,8 @@ def compare(
     return Comparison(relative, float(error.abs().max()), step)
 
 
-def plot_gradient(path: str | Path, gradient: Tensor, scene: Scene, title: str) -> None:
-    """Draw dJ/dP_ij (n_x, n_y) as a PNG of the screen seen from +z: x to the right, y up, mm.
+def plot_gradient(path: str | Path, gradient: Tensor, screen: Screen, title: str, unit: str = "mm") -> None:
+    """Draw dJ/dP_ij (n_x, n_y) as a PNG of the screen seen from +z: x to the right, y up; unit: of both.
 
     It shows the part of the screen where they are not zero (`shown_part`).  Colours diverge symmetrically about 0 and exact zeros
     are white, which shows how far the control point reaches.  The same numbers give the same bytes.
@@ -202,7 +211,7 @@ def plot_gradient(path: str | Path, gradient: Tensor, scene: Scene, title: str) 
     """
     g = np.asarray(gradient.detach().cpu(), dtype=np.float64)
     limit = float(np.abs(g).max()) or 1.0
-    (rx, ry), figure = scene.screen.half_size, Figure(figsize=(6.4, 5.2), dpi=150, layout="constrained")
+    (rx, ry), figure = screen.half_size, Figure(figsize=(6.4, 5.2), dpi=150, layout="constrained")
     axes = figure.add_subplot()
     shown = axes.imshow(
         np.ma.masked_equal(g, 0.0).T,
@@ -213,11 +222,11 @@ def plot_gradient(path: str | Path, gradient: Tensor, scene: Scene, title: str) 
         vmax=limit,
         interpolation="nearest",
     )  # the colour of 0 is grey: white stands out
-    (low_x, high_x), (low_y, high_y) = shown_part(g, scene.screen)
+    (low_x, high_x), (low_y, high_y) = shown_part(g, screen)
     axes.set(
-        xlabel="x (mm)",
-        ylabel="y (mm)",
-        title=f"{title}\n({high_x - low_x:.3g} x {high_y - low_y:.3g} mm of the screen's {2 * rx:.3g} x {2 * ry:.3g})",
+        xlabel=f"x ({unit})",
+        ylabel=f"y ({unit})",
+        title=f"{title}\n({high_x - low_x:.3g} x {high_y - low_y:.3g} {unit} of the screen's {2 * rx:.3g} x {2 * ry:.3g})",
         facecolor="white",
         xlim=(low_x, high_x),
         ylim=(low_y, high_y),
@@ -265,21 +274,21 @@ def _under(
     state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
     traced = Tracer(system, state, requests=STAGES)
     x, y = traced.trace_element(traced.first, traced.start, heights).hit.local[:2]
-    in_u, in_v = _in_support(field, control, *(0.5 * (c / r + 1.0) for c, r in zip((x, y), field.half_size, strict=True)))
+    in_u, in_v = in_support(field, control, *(0.5 * (c / r + 1.0) for c, r in zip((x, y), field.half_size, strict=True)))
     return state.only(in_u & in_v)
 
 
 def _sampled_under(field: HeightField, control: tuple[int, int], sample: Sample) -> Sample:
     """The rays of a sample of the exit itself in the support of a basis function."""
-    (in_u, in_v), flux = _in_support(field, control, sample.u, sample.v), sample.flux
+    (in_u, in_v), flux = in_support(field, control, sample.u, sample.v), sample.flux
     if sample.tensor:
         return Sample(sample.u[in_u], sample.v[in_v], True, flux[in_u][:, in_v] if flux.ndim else flux)
     both = in_u & in_v
     return Sample(sample.u[both], sample.v[both], False, flux[both] if flux.ndim else flux)
 
 
-def _in_support(field: HeightField, control: tuple[int, int], u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Which u and which v are in the closed support [t_i, t_{i+p+1}] x [t_j, t_{j+q+1}] of a basis function."""
+def in_support(field: HeightField, control: tuple[int, int], u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Which u and which v, in [0, 1], are in the closed support [t_i, t_{i+p+1}] x [t_j, t_{j+q+1}] of a basis function."""
     inside = []
     for space, k, at in zip(field.spaces, control, (u, v), strict=True):
         low, high = float(space.knots[k]), float(space.knots[k + space.degree + 1])

@@ -30,6 +30,7 @@ from caustic_cli.inverse.lamp_limits import chip_limits
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
 from caustic_cli.loading import OnDemand
+from caustic_cli.optics.lamp_array import clear_pitch
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.project import checkpoint, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
@@ -51,6 +52,8 @@ lamp_report = OnDemand("caustic_cli.studies.lamp_report")
 VERIFIED, BESIDE_RAYS = 2400, 1_000_000
 #: The effect that a lamp may have or not.
 GHOSTS = "ghosts"
+#: Part of the light that meets lenses of neighbours which is told.
+SHADOWED = 0.002
 #: Part of the brightest pixels of an image that are white.
 WHITE = 0.999
 
@@ -246,6 +249,8 @@ def _run(project: Project, before: Checkpoint | None, force: bool, say: Reporter
             values = design_lamp(lamp, goal, picture, **how, on_iteration=told, on_stage=save)
         found = LampDesign(project, lamp, goal, field_of(effort), values, picture, {})
         evaluation = found.evaluated(None, s.design.seed)
+        for words in warnings(lamp, goal, evaluation.figures):
+            say.say(words)
         seconds = earlier + began.seconds
         figures = evaluation.figures | {"iterations": len(history), "seconds": seconds, "reason": "iterations"}
         if project.path is not None:
@@ -270,6 +275,16 @@ def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
         yield (
             f"one surface of index {lamp.index:.4g} turns light by at most {most:.1f} degrees, and that of the rim would have to be"
             f" turned by {needed:.0f} to reach the nearest edge of the picture: part of it falls beside"
+        )
+
+
+def warnings(lamp: Lamp, goal: Goal, figures: Mapping[str, Any]) -> Iterator[str]:
+    """What is wrong with the light of a lamp, after its evaluation: shadows of an array."""
+    if (part := figures["lost"].get("neighbours", 0.0)) > SHADOWED:
+        clear = " x ".join(f"{math.ceil(p)}" for p in clear_pitch(lamp, goal))
+        yield (
+            f"{part:.1%} of the light meets the lens of a neighbour and is missing at the ends of the picture: with a ⟨lamp.pitch⟩"
+            f" of {clear} mm all light for it passes"
         )
 
 
@@ -312,6 +327,8 @@ def render(
     made.refuse_foreign(force)
     lamp = with_effects(LampDesign.of(project), effects)
     seen = lamp.evaluated(rays, project.seed if seed is None else seed)
+    for words in warnings(lamp.lamp, lamp.goal, seen.figures):
+        say.say(words)
     _write_image(path, seen.image, project, lamp.goal, WIDE if image is None else 1)
     if npy is not None:
         write_npy(npy, seen.image)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
-from caustic_cli.export import lamp_mitsuba, obj, ply, stl, threemf
-from caustic_cli.export.lamp import SAMPLES, lamp_mesh
+from caustic_cli.export import lamp_mitsuba, obj, ply, pob, stl, threemf
+from caustic_cli.export.lamp import SAMPLES, lamp_mesh, lamp_parts
 from caustic_cli.export.lamp_step import write_lamp_step
 from caustic_cli.inverse.lamp import pixels_of
 from caustic_cli.io.photometry import Photometry, write_ies, write_ldt
@@ -51,6 +51,10 @@ def _mesh(write: Callable[..., None], path: Path, found: Exported, samples: Samp
     write(path, *lamp_mesh(found.lamp, found.field, found.values, samples))
 
 
+def _pob(path: Path, found: Exported, samples: Samples) -> None:
+    pob.write_pob(path, lamp_parts(found.lamp, found.field, found.values, samples), ("inner surface", "outer surface", "foot"))
+
+
 def _step(path: Path, found: Exported, _: Samples) -> None:
     write_lamp_step(path, found.lamp, found.field, found.values)
 
@@ -75,14 +79,14 @@ FORMATS = {
     "ply": Format(".ply", partial(_mesh, ply.write_mesh)),
     "obj": Format(".obj", partial(_mesh, obj.write_mesh)),
     "3mf": Format(".3mf", partial(_mesh, threemf.write_mesh)),
+    "zemax": Format(".pob", _pob),
+    "lighttools": Format(".step", _step, False),
     "mitsuba": Format(".xml", _mitsuba, companions=lamp_mitsuba.companions),
     "ies": Format(".ies", partial(_photometry, write_ies), False),
     "ldt": Format(".ldt", partial(_photometry, write_ldt), False),
 }
 #: What formats hold that have no lamp.
 HOLDS = {
-    "zemax": "a grid of sags over x and y (Grid Sag)",
-    "lighttools": "the points of a surface over x and y",
     "gcode": "the path of a tool above a height at each x and y",
     "phase": "the phase of a thin element at each x and y",
 }
@@ -98,7 +102,7 @@ def check_export(format: str, samples: Samples | None) -> None:
         what = HOLDS.get(format, "a height at each x and y")
         raise InputError(
             f"⟨format⟩ {format} holds {what}, and a lamp's surface is none of that: it has two sides and may overhang;"
-            f" {', '.join(FORMATS)} hold the lamp or its light, step as a solid for LightTools and OpticStudio, too"
+            f" {', '.join(FORMATS)} hold the lamp or its light, step and lighttools as a solid, zemax as a Polygon Object"
         )
     if samples is not None and not FORMATS[format].sampled:
         raise InputError(f"⟨samples⟩ belongs to {', '.join(name for name in FORMATS if FORMATS[name].sampled)}, got {format}")
