@@ -403,7 +403,8 @@ def test_parts_in_other_light_and_mirrors_are_judged_too(name, lens, here, monke
     monkeypatch.setattr(photographs, "RAYS", 160)
     arguments, light, rms = LIGHTS[name]
     picture = str(lens.project.path.parent / "picture.npy")
-    how = "--mag 3 --resolution 64 --control 35 --waves off --iterations 15 --rays 100000 --quiet".split()
+    size = ["--mag", "3", "--resolution", "64", "--control", "35"]
+    how = [*size, "--waves", "off", "--iterations", "15", "--rays", "100000", "--quiet"]
     assert cli.run(["design", picture, *how, *arguments, "-o", "other.caustic"]) == 0
     other, error = load("other.caustic"), form_error(5.0, rms, 10 / 3, 3)
     screen = other.scene.screen

@@ -59,10 +59,10 @@ def taken(home, lens, heights, error, sigma, seed, **how):
 def judged(lens, um, length, sigma, seed, by_waves=False, **how):
     """A row of figures: nominal, as made, predicted and after the correction, registered and in the frame of the wall."""
     error = form_error(lens.field.half_size[0], 1e-3 * um, 2 * lens.field.half_size[0] * length, seed)
-    aim = lens.target / lens.target.mean()
+    aim, rays = lens.target / lens.target.mean(), how.get("rays", 1400)
 
     def errors(heights, off):
-        image = image_of(lens, heights, off, lens.target.shape, rays=how.get("rays", 1400))
+        image = image_of(lens, heights, off, lens.target.shape, rays=rays)
         return relative_rms(image, aim), relative_rms(registered(image, aim), aim)
 
     how |= {"wave": waves(lens, lens.heights, error)} if by_waves else {}
@@ -123,9 +123,9 @@ def main():
         rounds(asked.project, *CASES[asked.only or 0], asked.rounds)
         return
     if asked.quick:
-        photographs.RAYS, correction.LEAST = 160, 60_000
-        inference.LEVELS = ((32, 6, 1.0, 4), (64, 16, 0.7, 8))
-        how |= {"rays": 800, "size": (450, 400), "blur": 0.8}
+        photographs.RAYS, correction.LEAST, correction.EACH, correction.DRAWS = 112, 60_000, 16, 6
+        inference.LEVELS = ((32, 6, 1.0, 3), (48, 12, 0.7, 8))
+        how |= {"rays": 700, "size": (450, 400), "blur": 0.8}
     tally = []
     cases = list(random_cases(asked.random)) if asked.random else CASES
     cases = cases if asked.only is None else [cases[asked.only]]

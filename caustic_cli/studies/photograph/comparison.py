@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import least_squares
 
 from caustic_cli.io.files import SOFTWARE, atomic_file
@@ -66,22 +66,24 @@ def compare(photograph: Photograph, view: View, target: np.ndarray, image: np.nd
     )
 
 
-def _at(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """An image (n, m) at points (X, Y)."""
+def _at(image: np.ndarray, x: np.ndarray, y: np.ndarray, prefilter: bool = True) -> np.ndarray:
+    """An image (n, m) at points (X, Y); prefilter: False for the coefficients of its spline."""
     places = [(c + 1.0) * 0.5 * k - 0.5 for c, k in zip((x, y), image.shape, strict=True)]
-    return map_coordinates(image, places, order=3, mode="nearest")
+    return map_coordinates(image, places, order=3, mode="nearest", prefilter=prefilter)
 
 
 def registered(image: np.ndarray, aim: np.ndarray) -> np.ndarray:
     """An image (n, m), displaced by the affine map that brings it closest to another, over its mean."""
     n, m = aim.shape
     x, y = np.meshgrid(*(2.0 * (np.arange(k) + 0.5) / k - 1.0 for k in (n, m)), indexing="ij")
+    coefficients = spline_filter(image, order=3, mode="nearest")
 
     def moved(p: np.ndarray) -> np.ndarray:
-        found = _at(image, x + p[0] + p[1] * x + p[2] * y, y + p[3] + p[4] * x + p[5] * y)
+        found = _at(coefficients, x + p[0] + p[1] * x + p[2] * y, y + p[3] + p[4] * x + p[5] * y, prefilter=False)
         return found / found.mean()
 
-    best = least_squares(lambda p: (moved(p) - aim).ravel(), np.zeros(6), diff_step=1e-4, x_scale=0.01, max_nfev=20)
+    how = {"diff_step": 1e-4, "x_scale": 0.01, "max_nfev": 20, "ftol": 1e-5, "xtol": 1e-4}
+    best = least_squares(lambda p: (moved(p) - aim).ravel(), np.zeros(6), **how)
     return moved(best.x)
 
 
