@@ -101,6 +101,8 @@ LONG = (
     "test_files_of_one_index_have_that_of_the_one_wavelength",
     "test_an_addition_touches_few_files",
     "test_no_correction_makes_a_part_worse",
+    "test_parts_in_other_light_and_mirrors_are_judged_too",
+    "test_photographs_at_two_throws_tell_the_scale_of_the_relief_from_the_throw",
     "test_corners_and_the_picture_itself_find_the_screen_too",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.001-0.05-1]",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.003-0.25-3]",

@@ -17,12 +17,12 @@ from caustic_cli.studies.photograph import inference, registration
 from caustic_cli.studies.photograph.camera import displacements, fit_camera, rectified
 from caustic_cli.studies.photograph.card import RADIUS, find_marks, marks_of_card, write_card
 from caustic_cli.studies.photograph.comparison import registered, surfaces
-from caustic_cli.studies.photograph.model import Grid, Guess, PartModel, Prediction, Response, deviation
+from caustic_cli.studies.photograph.model import Grid, Guess, PartModel, Prediction, Response, View, deviation
 from caustic_cli.workflow import correction, photographs
 from caustic_cli.workflow.reporter import Listener
 
 sys.path.insert(0, str(Path(__file__).parent / "independent"))
-from photographs import form_error, image_of, photographed, relative_rms
+from photographs import form_error, image_of, landed_from, photographed, relative_rms
 
 #: Standard deviation of the marks of a file, pixels.
 SHARP, BLURRED = 0.05, 0.25
@@ -82,6 +82,11 @@ def photograph(lens, error, sigma, seed=0, heights=None, **how) -> str:
     rows = np.concatenate([pixels, known * np.array(lens.scene.screen.half_size)], 1)
     Path("marks.csv").write_text("column,row,x,y\n" + "\n".join(",".join(f"{v:.6f}" for v in row) for row in rows))
     return "marks.csv"
+
+
+def judged(lens, marks=None, corners=None, photos=("wall.jpg",)):
+    """What is found of photographs."""
+    return photographs.judge(lens, photographs.shots([*map(Path, photos)], marks, corners), Listener())
 
 
 def errors(lens, heights, error) -> tuple[float, float]:
@@ -179,26 +184,31 @@ def test_the_card_is_drawn_as_seen_from_the_lens(here):
 
 def test_derivatives_of_the_codes_are_those_of_the_model(lens):
     model, grid = PartModel(lens.scene, lens.field, lens.heights, 160**2), Grid((48, 48), 1.0)
-    guess = Guess(Response(-1.5), np.zeros(9), 0.0, np.zeros((6, 6)))
+    guess = Guess((View(Response(-1.5), np.zeros(9), 0.2),), 0.0, np.zeros((6, 6)))
     prediction = Prediction.of(model, grid, guess)
     by_shape, by_response = np.concatenate(list(prediction.by_shape())), prediction.by_response()
 
     def numeric(step, **change):
-        more, less = ({k: v(s) for k, v in change.items()} for s in (step, -step))
-        return (
-            Prediction.of(model, grid, replace(guess, **more)).codes - Prediction.of(model, grid, replace(guess, **less)).codes
-        ) / (2 * step)
+        def codes(s):
+            new = {k: v(s) for k, v in change.items()}
+            of_view = {k: new.pop(k) for k in ("response", "camera", "throw") if k in new}
+            return Prediction.of(model, grid, replace(guess, views=(replace(guess.views[0], **of_view),), **new)).codes
+
+        return (codes(step) - codes(-step)) / (2 * step)
 
     for k in (0, 4, 8):
         along = numeric(1e-4, camera=lambda s, k=k: s * np.eye(9)[k])
         assert np.abs(by_shape[k] - along).max() < 1e-3 * np.abs(along).max()
-    along = numeric(1e-4, scale=lambda s: s)
+    along = numeric(1e-2, throw=lambda s: 0.2 + s)
     assert np.abs(by_shape[9] - along).max() < 1e-3 * np.abs(along).max()
+    along = numeric(1e-4, scale=lambda s: s)
+    assert np.abs(by_shape[10] - along).max() < 1e-3 * np.abs(along).max()
     for k, m in ((0, 1), (3, 2), (5, 5)):
         along = numeric(1e-6, modes=lambda s, k=k, m=m: s * np.eye(36)[6 * k + m].reshape(6, 6))
-        assert np.abs(by_shape[10 + 6 * k + m] - along).max() < 1e-3 * np.abs(along).max()
+        assert np.abs(by_shape[11 + 6 * k + m] - along).max() < 1e-3 * np.abs(along).max()
+    response = guess.views[0].response
     for k, name in enumerate(("log_gain", "background", "log_gamma")):
-        along = numeric(1e-5, response=lambda s, n=name: replace(guess.response, **{n: getattr(guess.response, n) + s}))
+        along = numeric(1e-5, response=lambda s, n=name: replace(response, **{n: getattr(response, n) + s}))
         assert np.abs(by_response[k] - along).max() < 1e-3 * np.abs(along).max()
 
 
@@ -207,7 +217,7 @@ def test_derivatives_reach_a_traced_part(lens):
     model = PartModel(lens.scene, lens.field, lens.heights, 60**2)
     modes = np.zeros((4, 4))
     modes[1, 2] = modes[3, 0] = 2e-3
-    guess = Guess(Response(), np.zeros(9), 0.01, modes)
+    guess = Guess((View(Response(), np.zeros(9)),), 0.01, modes)
     near = model.landing(guess)
     model.trace(guess)
     exact = model.landing(guess)
@@ -223,7 +233,7 @@ def test_one_photograph_is_enough_for_a_smooth_form_error(lens, here, rms, sigma
     nominal, as judged by the independent tracer."""
     error = form_error(5.0, rms, 10 / 3, seed)
     marks = photograph(lens, error, sigma, seed)
-    found = photographs.judge(lens, Path("wall.jpg"), marks, None, Listener())
+    found = judged(lens, marks)
     _, off = surfaces(found.found)
     assert found.found.explained > 0.99
     assert (off - error - (off - error).mean()).std() < 0.15 * rms
@@ -239,9 +249,72 @@ def test_one_photograph_is_enough_for_a_smooth_form_error(lens, here, rms, sigma
     assert predicted["predicted"][0] == pytest.approx(after, abs=0.03)
 
 
+#: Fewer pixels and modes than the command takes.
+COARSE = ((32, 6, 1.0, 4), (48, 8, 1.0, 5))
+
+
+def at_throw(lens, name, heights, error, said, true, larger=1.0, seed=0) -> str:
+    """Write a photograph of a screen `larger` times as large, a TOML file that names it, and its marks; the name of that file."""
+    screen = lens.scene.screen
+    size = [larger * s for s in screen.size]
+    seen = replace(lens, scene=replace(lens.scene, screen=replace(screen, size=tuple(size))))
+    data, project = photographed(seen, heights, error, seed=seed, throw=true, rays=700)
+    Path(f"{name}.jpg").write_bytes(data)
+    known = marks_of_card()
+    pixels = np.stack(project(*known.T), 1) + SHARP * np.random.default_rng(seed + 100).standard_normal(known.shape)
+    np.savetxt(f"{name}.csv", np.concatenate([pixels, known * np.array(size) / 2], 1), delimiter=",")
+    Path(f"{name}.toml").write_text(f'photo = "{name}.jpg"\nmarks = "{name}.csv"\nthrow = {said}\n[screen]\nsize = {size}\n')
+    return f"{name}.toml"
+
+
+def test_photographs_at_two_throws_tell_the_scale_of_the_relief_from_the_throw(lens, here, monkeypatch, capfd):
+    """A relief 2 % too high on a part that stands 3 mm farther from all screens than it is said to: one photograph shows the
+    product, 3 %, two show both."""
+    monkeypatch.setattr(inference, "LEVELS", COARSE)
+    monkeypatch.setattr(photographs, "RAYS", 120)
+    made, error = lens.heights.mean() + 1.02 * (lens.heights - lens.heights.mean()), form_error(5.0, 1e-3, 5.0, 1)
+    near = at_throw(lens, "near", made, error, 300, 303)
+    far = at_throw(lens, "far", made, error, 450, 453, 1.6, seed=1)
+    alone, both = judged(lens, photos=[near]), judged(lens, photos=[near, far])
+    (product, sigma), own = alone.found.scale, 1.02 * 303 / 300
+    assert abs(product - own) < 3.5 * sigma < 0.01 and not alone.found.throws_free
+    scale, sigma = both.found.scale
+    assert abs(scale - 1.02) < 2.5 * sigma < 0.02
+    assert both.found.of_view(0)[13] < 2.5 and abs(both.found.guess.views[0].throw - 3.0) < 2.5 * both.found.of_view(0)[13]
+    words = " ".join(both.figures["part"]["not_told_apart"])
+    assert "throw" not in words and "throw and index" in " ".join(alone.figures["part"]["not_told_apart"])
+    assert len(both.figures["others"]) == 1 and both.figures["others"][0]["file"] == "far.jpg"
+    arguments = ["render", str(lens.project.path), "--photo", near, "--photo", far, "--rays", "20000", "-o", "r.png"]
+    assert cli.run([*arguments, "--json", "--quiet"]) == 0
+    found = json.loads(capfd.readouterr().out)["photo"]
+    assert found["part"]["relief_scale"] == pytest.approx(scale) and found["screen_farther_mm"][0] > 0
+    assert cli.run([*arguments, "--marks", "near.csv", "--quiet"]) == 2
+    assert "--marks are of one photograph" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("photo = 3", "photo must name a file"),
+        ('marks = "m.csv"', "photo must name a file"),
+        ('photo = "wall.jpg"\nthrow = -1', "throw must be greater than 0"),
+        ('photo = "wall.jpg"\n[lens]\nindex = 1.5', "[lens] is not of a photograph"),
+        ('photo = "wall.jpg"\n[screen]\nfar = 1', "near.toml"),
+        ('photo = "wall.jpg"\nscreen_corners = ["1,2"]', "four texts"),
+        ('photo = "wall.jpg"\nmarks = "a"\nscreen_corners = ["1,2"]', "leave one out"),
+        ('photo = "none.jpg"', "none.jpg"),
+    ],
+)
+def test_a_file_that_names_a_photograph_badly_is_refused(lens, here, capfd, text, words):
+    photograph(lens, None, SHARP, rays=200)
+    Path("near.toml").write_text(text)
+    assert cli.run(["design", "--correct", "near.toml", str(lens.project.path), "-o", "x.caustic", "--quiet"]) == 2
+    assert words in (said := capfd.readouterr().err) and said.count("\n") == 1
+
+
 def test_a_part_without_errors_is_left_alone(lens, here):
     marks = photograph(lens, None, SHARP)
-    found = photographs.judge(lens, Path("wall.jpg"), marks, None, Listener())
+    found = judged(lens, marks)
     assert found.found.rms()[0] < 1e-4
     heights = correction.corrected_heights(lens.project, lens, found, "cpu")
     before, after = errors(lens, lens.heights, None), errors(lens, heights, None)
@@ -262,7 +335,7 @@ def test_no_correction_makes_a_part_worse(lens, here, seed):
         "quality": int(rng.integers(75, 98)),
     }
     marks = photograph(lens, error, sigma, seed, **how)
-    found = photographs.judge(lens, Path("wall.jpg"), marks, None, Listener())
+    found = judged(lens, marks)
     heights = correction.corrected_heights(lens.project, lens, found, "cpu")
     predicted = correction.predicted(lens, found, heights)
     try:
@@ -313,6 +386,39 @@ def test_the_commands_close_the_loop(lens, here, capfd):
         assert errors(best, best.heights, error)[1] < after[1] + 0.01
     else:
         assert ended == 1 and "nothing to correct for certain" in said.err and not Path("best.caustic").exists()
+
+
+#: Other light: settings of the design, of the independent tracer, RMS of the form error in mm.
+LIGHTS = {
+    "a point": (["--source", "point", "--source-position", "0,0,-200"], {"point": (0.0, 0.0, -200.0)}, 1.5e-3),
+    "the sun": (["--source", "disc", "--source-angle", "0.53"], {"angle": 0.265}, 1.5e-3),
+    "a mirror": (["--mirror"], {}, 0.5e-3),
+}
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_parts_in_other_light_and_mirrors_are_judged_too(name, lens, here, monkeypatch):
+    """The inferred surface, by an independent tracer of that light, and its stated uncertainty."""
+    monkeypatch.setattr(inference, "LEVELS", ((32, 6, 1.0, 4), (64, 10, 1.0, 5)))
+    monkeypatch.setattr(photographs, "RAYS", 160)
+    arguments, light, rms = LIGHTS[name]
+    picture = str(lens.project.path.parent / "picture.npy")
+    size = ["--mag", "3", "--resolution", "64", "--control", "35"]
+    how = [*size, "--waves", "off", "--iterations", "15", "--rays", "100000", "--quiet"]
+    assert cli.run(["design", picture, *how, *arguments, "-o", "other.caustic"]) == 0
+    other, error = load("other.caustic"), form_error(5.0, rms, 10 / 3, 3)
+    screen = other.scene.screen
+    data, project = photographed(
+        other, other.heights, error, light=landed_from(other, other.heights, error, **light), size=(450, 400), blur=0.8
+    )
+    Path("wall.jpg").write_bytes(data)
+    known = marks_of_card()
+    places = known * np.array(screen.half_size) + np.array(screen.shift)
+    np.savetxt("marks.csv", np.concatenate([np.stack(project(*known.T), 1), places], 1), delimiter=",")
+    found = judged(other, "marks.csv")
+    off = surfaces(found.found)[1] - error
+    assert found.found.explained > 0.999
+    assert off.std() < 0.3 * rms and off.std() < 2.5 * found.found.uncertainty() < 1.5 * rms
 
 
 # Refusals
@@ -401,8 +507,8 @@ def test_corners_and_the_picture_itself_find_the_screen_too(lens, here):
     data, project = photographed(lens, lens.heights, error, distortion=0.0)
     Path("wall.jpg").write_bytes(data)
     corners = tuple(f"{a:.2f},{b:.2f}" for a, b in np.stack(project(*np.array(registration.CORNERS).T), 1))
-    by_corners = photographs.judge(lens, Path("wall.jpg"), None, corners, Listener())
-    itself = photographs.judge(lens, Path("wall.jpg"), None, None, Listener())
+    by_corners = judged(lens, None, corners)
+    itself = judged(lens, None)
     heights = correction.corrected_heights(lens.project, lens, by_corners, "cpu")
     assert errors(lens, heights, error)[1] < 0.5 * errors(lens, lens.heights, error)[1]
     assert by_corners.found.explained > 0.999 and itself.found.explained > 0.99
@@ -414,8 +520,8 @@ def test_corners_and_the_picture_itself_find_the_screen_too(lens, here):
 
 def test_draws_have_the_covariance_of_the_fit(lens, here):
     marks = photograph(lens, form_error(5.0, 1e-3, 10 / 3, 6), SHARP)
-    found = photographs.judge(lens, Path("wall.jpg"), marks, None, Listener()).found
+    found = judged(lens, marks).found
     modes = np.array([guess.modes for guess in found.draws(400)])
-    sigma = np.sqrt(np.diag(found.covariance)[14:]).reshape(modes.shape[1:])
+    sigma = np.sqrt(np.diag(found.of_part)[1:]).reshape(modes.shape[1:])
     np.testing.assert_allclose(modes.std(0)[1:4, 1:4], sigma[1:4, 1:4], rtol=0.2)
     assert deviation(found.model.field, found.guess.modes).std() > 5e-4 and inference.LEVELS[-1][1] == len(found.guess.modes)

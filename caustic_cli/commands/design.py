@@ -56,11 +56,12 @@ class DesignOptions(options.Computation):
         typer.Option("-o", "--out", metavar="DIR", help="Project directory.  [default: TARGET's stem + .caustic, here]"),
     ] = None
     correct: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
             metavar="PHOTO",
             help="Correct the lens of the project TARGET for the errors of the part in this photograph of its caustic: the heights"
-            " that give the picture with these errors added, into another project (-o); refused where the gain is not certain.",
+            " that give the picture with these errors added, into another project (-o); refused where the gain is not certain. "
+            f" {options.SEVERAL_PHOTOS}",
         ),
     ] = None
     marks: options.Marks = None
@@ -96,7 +97,7 @@ def run(asked: DesignOptions) -> None:
     asked.quiet = asked.quiet or not speaks
     say, target = asked.say, asked.target
     _check(asked)
-    if asked.correct is not None:
+    if asked.correct:
         _correct(asked)
         return
     piped = not asked.resume and str(target) == "-"
@@ -158,7 +159,7 @@ def _correct(asked: DesignOptions) -> None:
         raise InputError("--correct is for a lens before its light, not for a lamp around it")
     where = (asked.marks, asked.screen_corners, out)
     figures = correction.correct(asked.target, asked.correct, *where, force=asked.force, device=device, say=asked.say)
-    asked.say.table(f"photograph {asked.correct}", photograph.rows(figures["photo"]))
+    photograph.show(figures["photo"], asked.say)
     asked.say.table(figures["project"], correction.rows(figures))
     if asked.json:
         console.emit_json(figures)
@@ -189,7 +190,7 @@ def _check(asked: DesignOptions) -> None:
         raise InputError(f"--{names[0]} is what {'--plan compares' if asked.plan else '--error chooses'}: leave it out")
     if asked.plan and asked.error is not None:
         raise InputError("--plan designs nothing, so --error has no meaning beside it: leave one out")
-    if asked.correct is None and (asked.marks or asked.screen_corners):
+    if not asked.correct and (asked.marks or asked.screen_corners):
         raise InputError(f"--{'marks' if asked.marks else 'screen-corners'} belongs to --correct, which names the photograph")
     if asked.resume and (names := _beside_resume(asked)):
         raise InputError(

@@ -189,8 +189,10 @@ total_internal_reflection, away_from_screen, off_screen), image.
 For a render with \-\-photo: file, registered_by, marks, mark_sigma_px; error of the picture in the frame of the screen,
 as_photographed (codes taken for sRGB), registered (moved, stretched and sheared onto the picture) and against_lens (onto the image
 of the lens), relative RMS; missing_light, a fraction; camera (gamma, background, gain, blur_mm, and displacements_mm that its marks
-leave, each with its standard deviation); part: deviation_rms_um and relief_scale with their standard deviations (_sigma),
-uncertainty_um (RMS of the standard deviation over the part), explained (fraction of the variance), not_told_apart; files.
+leave, each with its standard deviation); explained (fraction of the variance); screen_farther_mm, by how much its screen was
+farther away than said, with its standard deviation, of photographs at several throws; others, the same of further photographs;
+part: deviation_rms_um and relief_scale with their standard deviations (_sigma), uncertainty_um (RMS of the standard deviation over
+the part), explained, not_told_apart; files.
 .TP
 .B correction
 For a design with \-\-correct: round; registered, predicted (registered errors of the part and of one of the corrected heights),

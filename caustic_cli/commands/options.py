@@ -38,6 +38,11 @@ At = Annotated[
     ),
 ]
 
+#: How photographs in other light or on another screen are given.
+SEVERAL_PHOTOS = (
+    'Repeatable: photographs of the same part, one on another screen or in other light as a TOML file, photo = "far.jpg", marks ='
+    ' "far.csv", throw = 400, and sections of project.toml.'
+)
 #: Where the screen is in a photograph.
 Marks = Annotated[
     str | None,

@@ -167,12 +167,12 @@ class OutputOptions(options.Given):
         ),
     ] = None
     photo: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
             metavar="PHOTO",
             help="Also judge a photograph of the caustic of the part that was made: on the screen (photo.png, photo.npy), its"
             " error, where light is missing (missing.png), and what is wrong with the part (part.png, part.npy,"
-            " deviation.npy: heights in mm over the aperture).",
+            f" deviation.npy: heights in mm over the aperture).  {options.SEVERAL_PHOTOS}",
         ),
     ] = None
     marks: options.Marks = None
@@ -301,7 +301,7 @@ def _checked_size(asked: RenderOptions) -> list[int]:
     designed = [option for option in others if getattr(asked, option.replace("-", "_"))]
     if asked.cut and designed:
         raise InputError(f"--cut goes without --{designed[0]}, which looks at the surface as designed")
-    if asked.photo is None and (asked.marks or asked.screen_corners):
+    if not asked.photo and (asked.marks or asked.screen_corners):
         raise InputError(f"--{'marks' if asked.marks else 'screen-corners'} belongs to --photo, which names the photograph")
     if asked.verify not in (None, "mitsuba"):
         raise InputError(f"--verify must be mitsuba, got {asked.verify!r}")

@@ -13,6 +13,7 @@ both, so that what is refused is a gain that is not certain.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.packing import rounded
 from caustic_cli.project.project import Project
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.studies.photograph import comparison, registration
+from caustic_cli.studies.photograph import comparison
 from caustic_cli.studies.photograph.model import Guess, deviation, scaled
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.workflow import photographs
@@ -49,7 +50,7 @@ PLOT = "correction.png"
 
 def correct(
     path: Path,
-    photo: Path,
+    photos: Sequence[Path],
     marks: str | None,
     corners: tuple[str, ...] | None,
     out: Path,
@@ -58,24 +59,23 @@ def correct(
     device: str = "cpu",
     say: Reporter,
 ) -> dict[str, Any]:
-    """Correct the lens of a project for the errors of a part, by a photograph of its caustic; the figures of the JSON table.
+    """Correct the lens of a project for the errors of a part, by photographs of its caustic; the figures of the JSON table.
 
     Raises:
-        InputError: the photograph is not one of this lens' caustic, or `out` exists.
-        CausticError: the photograph is explained badly, the gain is within its uncertainty, or no surface is within the limits.
+        InputError: a photograph is not one of this lens' caustic, or `out` exists.
+        CausticError: a photograph is explained badly, the gain is within its uncertainty, or no surface is within the limits.
     """
-    codes = registration.read_codes(photo)
+    taken = photographs.shots(photos, marks, corners)
     project = Project.open(path)
     lens = Lens.of(project)
     if why := photographs.refuse_lens(lens):
         raise InputError(why)
     directory.check(out, force)
-    judged = photographs.judge(lens, photo, marks, corners, say, codes)
-    with naming(photo):
-        refuse_bad_fit(judged)
+    judged = photographs.judge(lens, taken, say)
+    refuse_bad_fit(judged)
     heights = corrected_heights(project, lens, judged, device)
     figures = predicted(lens, judged, heights)
-    with naming(photo):
+    with naming(photos[0]):
         refuse_uncertain(figures)
     before = judged.before
     found = judged.found
@@ -89,23 +89,24 @@ def correct(
     directory.create(target, force, Checkpoint(state, lens.field.spaces, provenance(target, device), {}, inputs))
     designed = lens.heights if before is None else before.designed
     correction.write(out, correction.Correction(made - lens.heights, designed, history))
-    comparison.write_plot(out / PLOT, judged.shown, np.asarray(lens.target), found, lens.encoding)
+    comparison.write_plot(out / PLOT, judged.shown[0], np.asarray(lens.target), found, lens.encoding)
     target.hold.close()
     return {"project": str(out), "correction": figures | {"plot": str(out / PLOT)}, "photo": judged.figures}
 
 
 def refuse_bad_fit(judged: Judged) -> None:
-    """Refuse a photograph that the model does not explain.
+    """Refuse photographs that the model does not explain.
 
     Raises:
         CausticError: it does not.
     """
-    marked = judged.photograph.camera.marks > 0
-    if (explained := judged.found.explained) < (least := EXPLAINED if marked else EXPLAINED_ALONE):
-        raise CausticError(
-            f"is explained badly by a deviation of the part: {explained:.2%} of its variance, where {least:.2%} are needed"
-            f"{'' if marked else ' without marks'}; nothing is corrected"
-        )
+    for photograph, fit in zip(judged.photographs, judged.found.fits, strict=True):
+        marked = photograph.camera.marks > 0
+        if fit.explained < (least := EXPLAINED if marked else EXPLAINED_ALONE):
+            raise CausticError(
+                f"{photograph.path}: is explained badly by a deviation of the part: {fit.explained:.2%} of its variance, where"
+                f" {least:.2%} are needed{'' if marked else ' without marks'}; nothing is corrected"
+            )
 
 
 def corrected_heights(project: Project, lens: Lens, judged: Judged, device: str) -> Tensor:
@@ -128,7 +129,8 @@ def corrected_heights(project: Project, lens: Lens, judged: Judged, device: str)
 
 def predicted(lens: Lens, judged: Judged, heights: Tensor) -> dict[str, Any]:
     """Predicted errors of the picture of the part as it is and of a part of H', each with its standard deviation: registered and in
-    the frame of the screen; gain and its standard deviation, of registered errors; and how far H' is from H, RMS in µm."""
+    the frame of the screen; gain and its standard deviation, of registered errors; and how far H' is from H, RMS in µm.  Light of
+    the photograph that the fit does not explain may be of the part: it counts as uncertainty."""
     known = judged.before.deviation if judged.before is not None else torch.zeros_like(lens.heights)
     target = np.asarray(lens.target)
     rays = max(LEAST, EACH * target.size)
@@ -144,8 +146,11 @@ def predicted(lens: Lens, judged: Judged, heights: Tensor) -> dict[str, Any]:
     gain = now[:, 0] - then[:, 0]
     moved = heights - lens.heights
 
+    fit, seen = judged.found.fits[0], judged.shown[0].irradiance
+    unexplained = math.sqrt(max(0.0, 1.0 - fit.explained)) * float(seen.std() / seen.mean())
+
     def both(values: np.ndarray) -> list[float]:
-        return [float(values.mean()), float(values.std(ddof=1))]
+        return [float(values.mean()), math.hypot(float(values.std(ddof=1)), unexplained)]
 
     return {
         "registered": both(now[:, 0]),

@@ -1,17 +1,32 @@
-"""A photograph of the caustic of a part, judged: where its screen is, what it shows of the picture, and errors of the part."""
+"""Photographs of the caustic of a part, judged: where their screen is, what they show of the picture, and errors of the part.
+
+A photograph in another light or on another screen than the project's is named by a TOML file, with the sections of project.toml:
+
+    photo = "far.jpg"            beside that file
+    marks = "far.csv"            or screen_corners = ["C,R", "C,R", "C,R", "C,R"], or neither
+    throw = 400                  mm, for screen.z
+    [source]                     wavelengths, tilt, angle, ...
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
+from caustic_cli.config import settings
+from caustic_cli.config.settings import read_text
 from caustic_cli.errors import InputError
+from caustic_cli.io.files import naming
+from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.project import correction
+from caustic_cli.scene import Scene
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.photograph import comparison, inference, registration
 from caustic_cli.studies.photograph.camera import DISPLACEMENTS
@@ -23,53 +38,91 @@ from caustic_cli.workflow.reporter import Reporter
 RAYS = 320
 #: Fraction of its prior standard deviation down to which an unknown must be determined in order to count as told apart.
 TOLD = 0.5
+#: Sections of project.toml that a photograph may differ in.
+TAKEN = ("source", "screen")
 #: Correlation from which on two unknowns count as one.
 ALIKE = 0.9
 
-_MESSAGE = "⟨photo⟩ judges a single lens of uniform index and one surface to be made, in parallel light, and this one has {}"
+_MESSAGE = "⟨photo⟩ judges a single lens of uniform index and one surface to be made, and this one has {}"
+_PLACES = "⟨photo⟩ tells where light left the part by where it lands, which {} leave open: photograph it in the light of one"
 PHOTOGRAPHS = Capability(
     "photographs of a part",
     dict.fromkeys(
-        (
-            "mirror",
-            "gradient index",
-            "two sides",
-            "other elements",
-            "lenslet array",
-            "coloured picture",
-            "curved screen",
-            "far field",
-            "several sources",
-            "ray file",
-            "near source",
-            "light not parallel",
-        ),
+        ("gradient index", "two sides", "other elements", "lenslet array", "coloured picture", "curved screen", "far field"),
         _MESSAGE,
-    ),
+    )
+    | dict.fromkeys(("several sources", "separate places"), _PLACES)
+    | {"ray file": "⟨photo⟩ follows rays of their own through each point of the part, and {} are given"},
 )
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """A photograph of a part, with what it shows and what was inferred from it."""
+class Shot:
+    """A photograph as it is given: its file and codes, marks (a file) or corners of the screen (4, 2), and the light and the screen
+    by path in `schema.table` -> value, where they are not the project's; throw: for that of the screen, mm."""
 
-    photograph: registration.Photograph
+    path: Path
+    codes: np.ndarray
+    marks: Path | None = None
+    corners: np.ndarray | None = None
+    given: Mapping[str, Any] = field(default_factory=dict)
+    throw: float | None = None
+
+    def lens(self, lens: Lens) -> Lens:
+        """The lens in the light and before the screen of the photograph."""
+        given = dict(self.given)
+        if self.throw is not None:
+            given["screen.z"] = math.copysign(self.throw, lens.scene.screen.z)
+        return lens.under(given)
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Photographs of a part, with what they show and what was inferred from them."""
+
+    photographs: tuple[registration.Photograph, ...]
     found: inference.Inference
-    shown: comparison.ComparedPhotograph
+    #: Of each photograph.
+    shown: tuple[comparison.ComparedPhotograph, ...]
     #: What is known from earlier photographs.
     before: correction.Correction | None
-    #: Correlation of the photograph and the image of the lens, blurred.
-    like: float
+    #: Correlation of each photograph and the image of the lens, blurred.
+    like: tuple[float, ...]
+    #: The scene of each photograph.
+    scenes: tuple[Scene, ...]
+
+    @property
+    def marked(self) -> bool:
+        """Whether marks say where the screen is in each photograph."""
+        return all(one.camera.marks > 0 for one in self.photographs)
 
     @property
     def figures(self) -> dict[str, Any]:
         """As of the key `photo` of the table in JSON."""
-        p, f, s = self.photograph, self.found, self.shown
-        camera, response = p.camera, f.guess.response
+        f = self.found
         scale, left = f.scale
         rms, rms_left = f.rms()
-        rx = f.model.scene.screen.half_size[0]
-        kept = np.sqrt(np.diag(f.covariance))[4:13] * rx
+        part = {
+            "deviation_rms_um": 1e3 * rms,
+            "deviation_rms_sigma_um": 1e3 * rms_left,
+            "uncertainty_um": 1e3 * f.uncertainty(),
+            "relief_scale": scale,
+            "relief_scale_sigma": left,
+            "prior": {"amplitude_mm": f.prior.amplitude, "power": f.prior.power, "corner": f.prior.corner},
+            "explained": f.explained,
+            "residual_codes": f.fits[0].residual,
+            "correlated_px": f.fits[0].correlated,
+            "not_told_apart": not_told_apart(f, self.marked),
+            "rounds_before": 0 if self.before is None else len(self.before.history),
+        }
+        first, *others = (self._of(k) for k in range(len(self.photographs)))
+        return first | {"part": part} | ({"others": others} if others else {})
+
+    def _of(self, number: int) -> dict[str, Any]:
+        """Figures of one photograph."""
+        p, s, view = self.photographs[number], self.shown[number], self.found.guess.views[number]
+        camera, response, rx = p.camera, view.response, self.scenes[number].screen.half_size[0]
+        kept = self.found.of_view(number)
         return {
             "file": str(p.path),
             "registered_by": camera.found,
@@ -82,49 +135,40 @@ class Judged:
             "registered": s.registered,
             "against_lens": s.against_lens,
             "missing_light": s.missing_light,
-            "correlation": self.like,
+            "correlation": self.like[number],
+            "explained": self.found.fits[number].explained,
+            "screen_farther_mm": [view.throw, float(kept[13])] if self.found.throws_free else None,
             "camera": {
                 "gamma": math.exp(response.log_gamma),
                 "background": response.background,
                 "gain": math.exp(response.log_gain),
                 "blur_mm": math.exp(response.log_blur) * rx,
                 "displacements_mm": {
-                    name: [float(c * rx), float(e)] for name, c, e in zip(DISPLACEMENTS, f.guess.camera, kept, strict=True)
+                    name: [float(c * rx), float(e * rx)] for name, c, e in zip(DISPLACEMENTS, view.camera, kept[4:13], strict=True)
                 },
-            },
-            "part": {
-                "deviation_rms_um": 1e3 * rms,
-                "deviation_rms_sigma_um": 1e3 * rms_left,
-                "uncertainty_um": 1e3 * f.uncertainty(),
-                "relief_scale": scale,
-                "relief_scale_sigma": left,
-                "prior": {"amplitude_mm": f.prior.amplitude, "power": f.prior.power, "corner": f.prior.corner},
-                "explained": f.explained,
-                "residual_codes": f.residual,
-                "correlated_px": f.correlated,
-                "not_told_apart": not_told_apart(f, camera.marks > 0),
-                "rounds_before": 0 if self.before is None else len(self.before.history),
             },
         }
 
 
 def not_told_apart(found: inference.Inference, marked: bool) -> list[str]:
-    """What a photograph does not tell apart, always or by the uncertainty of this fit, in sentences; marked: whether
+    """What photographs do not tell apart, always or by the uncertainty of this fit, in sentences; marked: whether
     marks say where the screen is."""
+    several, shared = found.throws_free, inference.OWN * len(found.fits)
     words = [
         "piston: a surface that is higher all over gives the same picture",
         "tilt of the surface and tilt of the part where it was mounted: both shift the picture",
-        "scale of the relief, throw and index less one: the picture depends on their product",
+        f"scale of the relief{' and' if several else ', throw and'} index less one: the picture depends on their product",
     ]
     sigma = np.sqrt(np.diag(found.covariance))
-    alike = found.covariance / np.maximum(np.outer(sigma, sigma), 1e-300)
+    alike = np.abs(found.covariance / np.maximum(np.outer(sigma, sigma), 1e-300))
     count = len(found.guess.modes)
-    quadratics = [14 + k for k in (2, 2 * count, count + 1) if count > 2]  # (0, 2), (2, 0), (1, 1)
-    if sigma[13] > TOLD * inference.SCALE:
-        words.append("scale of the relief: the photograph says no more of it than was known before")
-    if any(abs(alike[13, k]) > ALIKE for k in (*quadratics, *range(6, 10))):
+    quadratics = [shared + 1 + k for k in (2, 2 * count, count + 1) if count > 2]  # (0, 2), (2, 0), (1, 1)
+    affine = [inference.OWN * k + c for k in range(len(found.fits)) for c in range(6, 10)]
+    if sigma[shared] > TOLD * inference.SCALE:
+        words.append("scale of the relief: no more is known of it than before")
+    if (alike[shared, [*quadratics, *affine]] > ALIKE).any():
         words.append("scale of the relief, and curvature of the part or size of the picture on the wall")
-    if any(abs(alike[k, c]) > ALIKE for k in quadratics for c in range(6, 10)):
+    if (alike[np.ix_(quadratics, affine)] > ALIKE).any():
         words.append("curvature and astigmatism of the part, and size and shear of the picture on the wall")
     if not marked:
         words.append("without marks: tilt, curvature and astigmatism of the part from where and how large the picture should be")
@@ -168,39 +212,96 @@ def corners_of(texts: tuple[str, ...] | None) -> np.ndarray | None:
     return np.array(found)
 
 
-def judge(
-    lens: Lens, photo: Path, marks: str | None, corners: tuple[str, ...] | None, say: Reporter, codes: np.ndarray | None = None
-) -> Judged:
-    """Judge a photograph; marks: a file of marks, or "auto"; corners: of the screen, as of `corners_of`.
+def shots(photos: Sequence[Path], marks: str | None = None, corners: tuple[str, ...] | None = None) -> tuple[Shot, ...]:
+    """Photographs by their files, or by TOML files that name them; marks and corners: of a single one that names none.
 
     Raises:
-        InputError: the photograph cannot be read, or is not one of the caustic of this lens.
+        InputError: a file cannot be read, or marks and corners do not belong to one photograph.
     """
-    assert lens.target is not None
-    codes = registration.read_codes(photo) if codes is None else codes
-    places = corners_of(corners)
+    file, places = None if marks in (None, "auto") else Path(str(marks)), corners_of(corners)
+    if file is not None and places is not None:
+        raise InputError("⟨marks⟩ and ⟨screen_corners⟩ both say where the screen is: leave one out")
+    found = []
+    for path in photos:
+        if path.suffix.lower() == ".toml":
+            found.append(_named_by(path))
+        else:
+            found.append(Shot(path, registration.read_codes(path), file, places))
+    if len(found) > 1 and not (file is None and places is None):
+        which = "marks" if places is None else "screen_corners"
+        raise InputError(f"⟨{which}⟩ are of one photograph, and there are {len(found)}; name each in a TOML file with its own")
+    return tuple(found)
+
+
+def files_of(path: Path) -> list[Path]:
+    """The files that a photograph is read from: its own, or a TOML file with those that it names, as far as it can be read."""
+    if path.suffix.lower() != ".toml":
+        return [path]
+    try:
+        named = settings.toml_of(read_text(path), f"{path}")
+    except InputError:
+        return [path]
+    return [path, *(path.parent / str(named[key]) for key in ("photo", "marks") if key in named)]
+
+
+def _named_by(path: Path) -> Shot:
+    """The photograph that a TOML file names, see the module."""
+    given = settings.toml_of(read_text(path), f"{path}")
+    own = {key: given.pop(key, None) for key in ("photo", "marks", "screen_corners", "throw")}
+    with naming(path):
+        for key in ("photo", "marks"):
+            if not isinstance(own[key], str) and not (key == "marks" and own[key] is None):
+                raise InputError(f'{key} must name a file, {key} = "wall.{"jpg" if key == "photo" else "csv"}"')
+        corners, throw = own["screen_corners"], own["throw"]
+        if corners is not None and own["marks"] is not None:
+            raise InputError("marks and screen_corners both say where the screen is: leave one out")
+        if corners is not None and not (isinstance(corners, list) and len(corners) == 4 and {*map(type, corners)} == {str}):
+            raise InputError('screen_corners must be four texts "column,row"')
+        if throw is not None and not (type(throw) in (int, float) and 0 < throw < math.inf):
+            raise InputError(f"throw must be greater than 0 mm, got {throw!r}")
+    scene = settings.checked(given, f"{path}")
+    if others := [section for section in scene if section not in TAKEN]:
+        raise InputError(f"{path}: [{others[0]}] is not of a photograph, whose sections are {', '.join(f'[{s}]' for s in TAKEN)}")
+    flat = {f"{section}.{key}": value for section, table in scene.items() for key, value in table.items()}
+    photo, marks = (None if own[key] is None else path.parent / own[key] for key in ("photo", "marks"))
+    return Shot(photo, registration.read_codes(photo), marks, corners_of(corners), flat, throw)
+
+
+def waves_of(lens: Lens, heights: Tensor) -> np.ndarray | None:
+    """The wave image of a lens that was refined on it, with other heights, over the mean of all light, (n, m); None of others."""
+    if not lens.by_waves:
+        return None
+    try:
+        found = wave_image(lens.scene, lens.field, heights.detach()).image.cpu().double().numpy()
+    except NoWaveImage:
+        return None
+    return found * found.size
+
+
+def judge(lens: Lens, taken: Sequence[Shot], say: Reporter) -> Judged:
+    """Judge photographs of one part.
+
+    Raises:
+        InputError: one is not of the caustic of this lens, or in a light in which none can be judged.
+    """
     heights, before = known_heights(lens)
-    model = PartModel(lens.scene, lens.field, heights, RAYS**2)
-    expected = image_of(model, lens.target.shape)
-    if lens.by_waves:
-        say.say("the lens was refined on its wave image, and the photograph is compared with rays: diffraction counts as blur")
-    screen = lens.scene.screen
-    file = None if marks in (None, "auto") else Path(str(marks))
-    seen = registration.register(photo, codes, expected, screen.half_size, screen.shift, marks=file, corners=places)
-    known = inference.Knowledge(seen.camera.covariance)
+    photographs, observations, lenses, expected = [], [], [], []
+    for shot in taken:
+        own = shot.lens(lens)
+        with naming(shot.path):
+            if why := refuse_lens(own):
+                raise InputError(why)
+        assert own.target is not None
+        wave = waves_of(own, heights)
+        model = PartModel(own.scene, own.field, heights, RAYS**2, wave)
+        image, screen = model.image(own.target.shape) if wave is None else wave, own.scene.screen
+        places = {"marks": shot.marks, "corners": shot.corners}
+        seen = registration.register(shot.path, shot.codes, image, screen.half_size, screen.shift, **places)
+        observations.append(inference.Observation(model, seen.on_screen, seen.camera.covariance))
+        photographs.append(seen), lenses.append(own), expected.append(image)
     with say.progress(None) as show:
-        found = inference.infer(
-            model,
-            seen.on_screen,
-            known,
-            show=lambda done, whole: show("photograph", "inferring the part", done, whole),
-        )
-    shown = comparison.compare(seen, found, lens.target, expected)
-    return Judged(seen, found, shown, before, registration.refuse_unlike(seen, expected))
-
-
-def image_of(model: PartModel, shape: tuple[int, int]) -> np.ndarray:
-    """E of the designed surface on n x m pixels of the screen."""
-    at, edges = model.designed, [np.linspace(-1.0, 1.0, n + 1) for n in shape]
-    light = np.histogram2d(at.x, at.y, edges, weights=at.power)[0]
-    return light / light.mean()
+        found = inference.infer(observations, show=lambda done, whole: show("photograph", "inferring the part", done, whole))
+    views = zip(photographs, found.guess.views, lenses, expected, strict=True)
+    shown = tuple(comparison.compare(seen, view, own.target, image) for seen, view, own, image in views)
+    like = tuple(registration.refuse_unlike(seen, image) for seen, image in zip(photographs, expected, strict=True))
+    return Judged(tuple(photographs), found, shown, before, like, tuple(own.scene for own in lenses))

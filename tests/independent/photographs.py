@@ -9,6 +9,7 @@ import io
 
 import numpy as np
 from PIL import Image
+from scipy import fft
 from scipy.interpolate import BSpline, CloughTocher2DInterpolator, LinearNDInterpolator, RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csc_matrix, hstack
@@ -67,6 +68,92 @@ def landed(lens, heights, error, rays=1400, index=None, throw=None):
     return (x[:, None] + far * d[0]).ravel(), (y[None] + far * d[1]).ravel()
 
 
+def landed_from(lens, heights, error, point=None, angle=0.0, rays=600, seed=0):
+    """Where light of a point source (x, y, z), mm, or of a sun of this half angle, degrees, around the axis lands behind a lens or
+    before a mirror: x and y from the middle of the screen, and power, (N,) each, by Newton's method on the surface."""
+    scene, (rx, ry), mirror = lens.scene, lens.field.half_size, lens.scene.lens.mirror
+    n, rng = scene.lens.index, np.random.default_rng(seed)
+    fine = [np.linspace(-r, r, 900) for r in (rx, ry)]
+    z = surface_at(lens.field, heights, *fine)[0]
+    if error is not None:
+        z = z + RectBivariateSpline(*(np.linspace(-r, r, k) for r, k in zip((rx, ry), error.shape, strict=True)), error)(*fine)
+    surface = RectBivariateSpline(*fine, z)
+    middle = float(z.mean())
+    plane = middle if mirror else scene.lens.z_in
+    x, y = ((1.02 * r * (2.0 * (np.arange(rays) + rng.uniform()) / rays - 1.0)) for r in (rx, ry))
+    x, y = (c.ravel() for c in np.meshgrid(x, y, indexing="ij"))
+    if point is None:
+        rho, phi = np.sin(np.radians(angle)) * np.sqrt(rng.uniform(size=x.shape)), 2 * np.pi * rng.uniform(size=x.shape)
+        d = np.stack([rho * np.cos(phi), rho * np.sin(phi), np.sqrt(1 - rho**2)])
+        power = np.ones_like(x)
+    else:
+        d = np.stack([x - point[0], y - point[1], np.full_like(x, plane - point[2])])
+        r = np.linalg.norm(d, axis=0)
+        d, power = d / r, d[2] / r**3
+    if not mirror:
+        d = np.stack([d[0] / n, d[1] / n, np.sqrt(1 - (d[0] ** 2 + d[1] ** 2) / n**2)])
+    t = (middle - plane) / d[2]
+    for _ in range(5):
+        px, py = x + t * d[0], y + t * d[1]
+        zx, zy = surface.ev(px, py, dx=1), surface.ev(px, py, dy=1)
+        t -= (plane + t * d[2] - surface.ev(px, py)) / (d[2] - zx * d[0] - zy * d[1])
+    px, py, pz = x + t * d[0], y + t * d[1], plane + t * d[2]
+    normal = np.stack([-zx, -zy, np.ones_like(zx)]) / np.sqrt(1 + zx**2 + zy**2)
+    cosine = (d * normal).sum(0)
+    bent = np.sqrt(1 - n * n * (1 - cosine**2)) - n * cosine
+    d = d - 2 * cosine * normal if mirror else n * d + bent * normal
+    far = (scene.screen.z - pz) / d[2]
+    inside = (np.abs(px) < rx) & (np.abs(py) < ry)
+    sx, sy = scene.screen.shift
+    return px + far * d[0] - sx, py + far * d[1] - sy, np.where(inside, power, 0.0)
+
+
+def waves(lens, heights, error, wavelengths=(0.00047, 0.00055, 0.00063), samples=3072, coarse=500, throw=None):
+    """Light of a plane wave behind a part on the screen as waves: half widths (mm) of a square grid and irradiance on it, over its
+    mean on the screen; wavelengths: mm.
+
+    The optical path behind the part, on a plane above it, follows rays; from there one Fourier transform (Goodman, Introduction to
+    Fourier optics, eq. 4-17), with `samples` along each side of the aperture.
+    """
+    scene, (rx, ry), n = lens.scene, lens.field.half_size, lens.scene.lens.index
+    x, y = (np.linspace(-r, r, coarse) for r in (rx, ry))
+    z, zx, zy = surface_at(lens.field, heights, x, y)
+    if error is not None:
+        ends = [np.linspace(-r, r, k) for r, k in zip((rx, ry), error.shape, strict=True)]
+        spline = RectBivariateSpline(*ends, error)
+        z, zx, zy = z + spline(x, y), zx + spline(x, y, dx=1), zy + spline(x, y, dy=1)
+    normal = np.stack([-zx, -zy, np.ones_like(z)]) / np.sqrt(1 + zx**2 + zy**2)
+    t = np.sqrt(1.0 - n * n * (1.0 - normal[2] ** 2)) - n * normal[2]
+    d = np.array([0.0, 0.0, n])[:, None, None] + t * normal
+    plane = z.max()
+    far = (plane - z) / d[2]
+    path, moved = RectBivariateSpline(x, y, n * z + far), [RectBivariateSpline(x, y, far * c) for c in d[:2]]
+    X, Y = np.meshgrid(x, y, indexing="ij")
+    at = [X.copy(), Y.copy()]
+    for _ in range(4):  # where the rays through the grid of the plane leave the part
+        at = [c - m.ev(*at) for c, m in zip((X, Y), moved, strict=True)]
+    (axx, axy), (ayx, ayy) = ([np.gradient(c, g, axis=k) for k, g in enumerate((x, y))] for c in at)
+    path, density = RectBivariateSpline(x, y, path.ev(*at)), RectBivariateSpline(x, y, axx * ayy - axy * ayx)
+    fine = [(2.0 * (np.arange(samples) + 0.5) / samples - 1.0) * r for r in (rx, ry)]
+    path, density, far = path(*fine), density(*fine), (scene.screen.z if throw is None else throw) - plane
+    count, step, light, half = fft.next_fast_len(4 * samples // 3), 2.0 * rx / samples, [], []
+    for wavelength in wavelengths:
+        k = 2.0 * np.pi / wavelength
+        bent = (fine[0][:, None] ** 2 + fine[1][None, :] ** 2) / (2.0 * far)
+        field = np.sqrt(density) * np.exp(1j * (k * ((path + bent) % wavelength)))
+        light.append(np.fft.fftshift(np.abs(fft.fft2(field, (count, count))) ** 2))
+        half.append(wavelength * far / (2.0 * step))
+    ends = [h * (2.0 * np.arange(count) / count - 1.0) for h in half]
+    common = ends[0]
+    total = sum(
+        RectBivariateSpline(e, e, a, kx=1, ky=1)(common, common) * (half[0] / h) ** 2
+        for e, a, h in zip(ends, light, half, strict=True)
+    )
+    sx, sy = scene.screen.half_size
+    total /= total.sum() * (common[1] - common[0]) ** 2 / (4.0 * sx * sy)
+    return common, total
+
+
 def image_of(lens, heights, error, resolution, **how):
     """The image on the screen's pixels: counted rays, over their mean."""
     (x, y), half = landed(lens, heights, error, **how), lens.scene.screen.half_size
@@ -92,13 +179,16 @@ def photographed(
     seed=0,
     rays=1400,
     marks=None,
+    wave=None,
+    light=None,
     **how,
 ):
     """An 8-bit photograph (rows, columns): of the screen through a projective camera with distortion; bytes of its JPEG, and the
     function that images (X, Y) of the screen, in half widths.
 
     view: (8,) projective map from (X, Y) to pixels before distortion; exposure: of the brightest 0.2 % of pixels, 1 saturates;
-    marks: (N, 2) centres of dark discs and their radius.
+    marks: (N, 2) centres of dark discs and their radius; wave: light on the screen as of `waves`, instead of rays;
+    light: rays as of `landed_from`.
     """
     w, h = size
     view = np.array([0.36 * w, 0.02 * w, 0.5 * w, 0.015 * h, -0.40 * h, 0.49 * h, 0.03, -0.02]) if view is None else view
@@ -111,18 +201,14 @@ def photographed(
         s = 1.0 + distortion * (a * a + b * b)
         return cx + half * s * a, cy + half * s * b
 
-    x, y = landed(lens, heights, error, rays=rays, **how)
     rx, ry = lens.scene.screen.half_size
-    a, b = project(x / rx, y / ry)
-    light = np.histogram2d(b, a, [np.arange(n + 1) - 0.5 for n in (h, w)])[0]
-    # irradiance on the wall is power per area of wall: a sensor sees radiance, so undo the area that a pixel covers there
-    X, Y = np.meshgrid(np.linspace(-1.6, 1.6, 81), np.linspace(-1.6, 1.6, 81))
-    e = 1e-4
-    (a0, b0), (a1, b1), (a2, b2) = project(X, Y), project(X + e, Y), project(X, Y + e)
-    area = np.abs((a1 - a0) * (b2 - b0) - (a2 - a0) * (b1 - b0)) / e**2
-    jj, ii = np.meshgrid(np.arange(w), np.arange(h))
-    pixels = LinearNDInterpolator(np.stack([a0.ravel(), b0.ravel()], 1), area.ravel(), fill_value=area.mean())(jj, ii)
-    light = light * pixels / (len(x) / 4.0)  # over the mean of all light on the screen
+    if wave is None:
+        x, y, *power = light or landed(lens, heights, error, rays=rays, **how)
+        light = _counted(project, size, x, y, power[0] if power else np.ones_like(x), rx, ry)
+    else:
+        X, Y = _inverse(project, size)
+        light = RectBivariateSpline(wave[0], wave[0], wave[1], kx=1, ky=1).ev(X * rx, Y * ry)
+        light = light.reshape(h, FINER, w, FINER).mean((1, 3))
     radiance = exposure / np.percentile(gaussian_filter(light, blur), 99.8) * light + background
     if marks is not None:
         centres, radius = marks
@@ -139,6 +225,21 @@ def photographed(
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "JPEG", quality=quality)
     return data.getvalue(), project
+
+
+def _counted(project, size, x, y, power, rx, ry):
+    """Radiance on the pixels of a sensor, over the mean of the screen, from rays."""
+    w, h = size
+    a, b = project(x / rx, y / ry)
+    light = np.histogram2d(b, a, [np.arange(n + 1) - 0.5 for n in (h, w)], weights=power)[0]
+    # irradiance on the wall is power per area of wall: a sensor sees radiance, so undo the area that a pixel covers there
+    X, Y = np.meshgrid(np.linspace(-1.6, 1.6, 81), np.linspace(-1.6, 1.6, 81))
+    e = 1e-4
+    (a0, b0), (a1, b1), (a2, b2) = project(X, Y), project(X + e, Y), project(X, Y + e)
+    area = np.abs((a1 - a0) * (b2 - b0) - (a2 - a0) * (b1 - b0)) / e**2
+    jj, ii = np.meshgrid(np.arange(w), np.arange(h))
+    pixels = LinearNDInterpolator(np.stack([a0.ravel(), b0.ravel()], 1), area.ravel(), fill_value=area.mean())(jj, ii)
+    return light * pixels / (power.sum() / 4.0)  # over the mean of all light on the screen
 
 
 def _inverse(project, size):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import least_squares
 
 from caustic_cli.io.files import SOFTWARE, atomic_file
@@ -15,7 +15,7 @@ from caustic_cli.io.picture import to_linear
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.photograph.camera import displacements
 from caustic_cli.studies.photograph.inference import Inference
-from caustic_cli.studies.photograph.model import cosines, heights_at
+from caustic_cli.studies.photograph.model import View, cosines, heights_at
 from caustic_cli.studies.photograph.registration import Photograph
 
 #: Points along each side of surface files, borders included.
@@ -41,14 +41,14 @@ class ComparedPhotograph:
     missing_light: float
 
 
-def compare(photograph: Photograph, found: Inference, target: np.ndarray, image: np.ndarray) -> ComparedPhotograph:
-    """Compare a photograph with the target and the image of the lens as designed, (n, m) each."""
+def compare(photograph: Photograph, view: View, target: np.ndarray, image: np.ndarray) -> ComparedPhotograph:
+    """Compare a photograph with the target and the image of the lens as designed, (n, m) each; view: what was fitted of it."""
     n, m = target.shape
     codes = photograph.on_screen((n, m))
     codes = np.where(np.isfinite(codes), codes, np.nanmedian(codes))
-    light = np.clip(found.guess.response.irradiance(codes), 0.0, None)
+    light = np.clip(view.response.irradiance(codes), 0.0, None)
     x, y = np.meshgrid(*(2.0 * (np.arange(k) + 0.5) / k - 1.0 for k in (n, m)), indexing="ij")
-    moved = np.einsum("k,kin->in", found.guess.camera, displacements(x.ravel(), y.ravel())).reshape(2, n, m)
+    moved = np.einsum("k,kin->in", view.camera, displacements(x.ravel(), y.ravel())).reshape(2, n, m)
     light = _at(light, x + moved[0], y + moved[1])
     light /= light.mean()
     aim, own = target / target.mean(), image / image.mean()
@@ -66,22 +66,24 @@ def compare(photograph: Photograph, found: Inference, target: np.ndarray, image:
     )
 
 
-def _at(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """An image (n, m) at points (X, Y)."""
+def _at(image: np.ndarray, x: np.ndarray, y: np.ndarray, prefilter: bool = True) -> np.ndarray:
+    """An image (n, m) at points (X, Y); prefilter: False for the coefficients of its spline."""
     places = [(c + 1.0) * 0.5 * k - 0.5 for c, k in zip((x, y), image.shape, strict=True)]
-    return map_coordinates(image, places, order=3, mode="nearest")
+    return map_coordinates(image, places, order=3, mode="nearest", prefilter=prefilter)
 
 
 def registered(image: np.ndarray, aim: np.ndarray) -> np.ndarray:
     """An image (n, m), displaced by the affine map that brings it closest to another, over its mean."""
     n, m = aim.shape
     x, y = np.meshgrid(*(2.0 * (np.arange(k) + 0.5) / k - 1.0 for k in (n, m)), indexing="ij")
+    coefficients = spline_filter(image, order=3, mode="nearest")
 
     def moved(p: np.ndarray) -> np.ndarray:
-        found = _at(image, x + p[0] + p[1] * x + p[2] * y, y + p[3] + p[4] * x + p[5] * y)
+        found = _at(coefficients, x + p[0] + p[1] * x + p[2] * y, y + p[3] + p[4] * x + p[5] * y, prefilter=False)
         return found / found.mean()
 
-    best = least_squares(lambda p: (moved(p) - aim).ravel(), np.zeros(6), diff_step=1e-4, x_scale=0.01, max_nfev=20)
+    how = {"diff_step": 1e-4, "x_scale": 0.01, "max_nfev": 20, "ftol": 1e-5, "xtol": 1e-4}
+    best = least_squares(lambda p: (moved(p) - aim).ravel(), np.zeros(6), **how)
     return moved(best.x)
 
 
@@ -130,12 +132,13 @@ def write_plot(path: Path, seen: ComparedPhotograph, target: np.ndarray, found: 
         shown = axis.imshow(image.T, cmap="RdBu" if low else "viridis", vmin=low, vmax=most if low else None, **part)
         axis.set_title(title, loc="left")
         figure.colorbar(shown, ax=axis, label="µm")
-    miss = found.seen - found.predicted
+    fit = found.fits[0]
+    miss = fit.seen - fit.predicted
     most = float(np.percentile(np.abs(miss), 99.5)) or 1.0
-    (left_x, right_x), (low_y, high_y) = found.window
+    (left_x, right_x), (low_y, high_y) = fit.window
     place["extent"] = (left_x * rx, right_x * rx, low_y * ry, high_y * ry)
     shown = axes[1, 2].imshow(miss.T, cmap="RdBu", vmin=-most, vmax=most, **place)
-    axes[1, 2].set_title(f"photograph - model: {found.explained:.2%} explained", loc="left")
+    axes[1, 2].set_title(f"photograph - model: {fit.explained:.2%} explained", loc="left")
     figure.colorbar(shown, ax=axes[1, 2], label="codes, 1 saturates")
     for axis in axes.ravel():
         axis.set(xlabel="x (mm)", ylabel="y (mm)")

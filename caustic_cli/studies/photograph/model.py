@@ -2,32 +2,38 @@
 
 Notation
     H           control heights of the exit as designed, (n, m) mm
-    d           deviation of the part, mm: a sum of cosine modes cos(k pi u) cos(l pi v) of unit RMS over a rectangle somewhat
-                larger than the aperture
+    d           deviation of the part, mm: a sum of products of cosines and straight lines, of unit RMS over a rectangle somewhat
+                larger than the aperture (`cosines`)
     s           scale of the relief, which is s times as high as it should be about its mean height
     c           amplitudes (9,) of the displacements of `camera.displacements`, half widths of the screen
+    t           by how much the screen of a photograph is farther away than it is said to be, mm
     E           irradiance over its mean on the screen, on the pixels of a grid
     L           light on the sensor, gain E + background, of which 1 saturates it
     code        min(L, 1)^(1 / gamma), in [0, 1]
 
 Rays lie on a regular lattice and are traced by the tracer of the project.  To first order a ray's landing point depends on the
 surface through height and slope where it leaves: three traces, of a surface raised and tilted a little, give the derivatives with
-respect to every mode.  The image is a sum of quadratic B-splines (3 x 3 pixels) of the landing points, blurred by a Gaussian.
+respect to every mode.  The image is a sum of quadratic B-splines (3 x 3 pixels) of the landing points, blurred by a Gaussian, and
+that of an extended source its convolution with the image of that source by the middle of the lens.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.signal import fftconvolve
 from scipy.sparse import csc_matrix
 from torch import Tensor
 
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.source_image import source_images
+from caustic_cli.optics.spread import POINT
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import tracers
@@ -37,6 +43,8 @@ from caustic_cli.studies.photograph.camera import displacements
 #: Height and slope of the surfaces by which derivatives are found: displacements of rays of a thousandth of a pixel, well above
 #: rounding.
 RAISED, TILTED = 1e-4, 1e-6
+#: Displacement of the screen for the same, mm.
+FARTHER = 0.1
 #: Width by which the rectangle of the modes is larger than the aperture at each of its edges, over the aperture: the slopes of
 #: cosines vanish at the edges of their rectangle, those of a part at its own do not.
 BEYOND = 0.15
@@ -85,11 +93,24 @@ class Response:
 
 
 @dataclass(frozen=True, eq=False)
-class Guess:
-    """Values of all unknowns: response, c, s - 1, and amplitudes (k, l) of the modes of d, mm."""
+class View:
+    """Values of the unknowns of one photograph: response, c and t."""
 
     response: Response
     camera: np.ndarray
+    throw: float = 0.0
+
+    @property
+    def values(self) -> np.ndarray:
+        """All of them, (4 + 9 + 1,)."""
+        return np.concatenate([self.response.values, self.camera, [self.throw]])
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """Values of all unknowns: those of each photograph, s - 1, and amplitudes (k, l) of the modes of d, mm."""
+
+    views: tuple[View, ...]
     scale: float
     modes: np.ndarray
 
@@ -102,15 +123,20 @@ class Guess:
 
 
 def cosines(u: np.ndarray, count: int) -> np.ndarray:
-    """Cosine modes of unit RMS over their rectangle at u in [0, 1] of the aperture, (N, count)."""
-    k = np.arange(count)
-    return np.cos(np.pi * np.outer((u + BEYOND) / (1.0 + 2.0 * BEYOND), k)) * np.where(k > 0, np.sqrt(2.0), 1.0)
+    """Modes of unit RMS over their rectangle at u in [0, 1] of the aperture, (N, count): cosines, but for the first after the
+    constant a straight line, so that tilt is a mode."""
+    k, at = np.arange(count), (u + BEYOND) / (1.0 + 2.0 * BEYOND)
+    found = np.cos(np.pi * np.outer(at, k)) * np.where(k > 0, np.sqrt(2.0), 1.0)
+    found[:, 1:2] = np.sqrt(3.0) * (1.0 - 2.0 * at)[:, None]
+    return found
 
 
 def slopes_of_cosines(u: np.ndarray, count: int) -> np.ndarray:
     """Derivatives of `cosines` by u."""
     k = np.arange(count) / (1.0 + 2.0 * BEYOND)
-    return -np.sin(np.pi * np.outer(u + BEYOND, k)) * (np.pi * k * np.sqrt(2.0))
+    found = -np.sin(np.pi * np.outer(u + BEYOND, k)) * (np.pi * k * np.sqrt(2.0))
+    found[:, 1:2] = -2.0 * np.sqrt(3.0) / (1.0 + 2.0 * BEYOND)
+    return found
 
 
 def deviation(field: HeightField, modes: np.ndarray) -> Tensor:
@@ -142,14 +168,20 @@ class Landing:
 
 
 class PartModel:
-    """The model of photographs of one part.
+    """The model of photographs of one part in one light on one screen.
 
     Args:
         scene, field, heights: the lens as it was designed, with the error known of it so far.
         rays: about how many.
+        wave: E of these heights as waves, (n, m) over the screen; diffraction is then the difference from rays that it makes of
+            this surface, of the deviation's it is not known.
     """
 
-    def __init__(self, scene: Scene, field: HeightField, heights: Tensor, rays: int):
+    def __init__(self, scene: Scene, field: HeightField, heights: Tensor, rays: int, wave: np.ndarray | None = None):
+        self.wave = wave
+        #: The image of an extended source by the middle of the part, which blurs that of its centre everywhere.
+        self.spread = next(iter(source_images(scene, middle=True)), POINT)
+        scene = replace(scene, source=scene.source.pointlike())
         self.scene, self.field, self.heights = scene, field, heights.detach().double().cpu()
         self._beyond = np.zeros((2, 1))
         self._tracers = list(tracers(scene, field, rays_of(scene, "grid", rays), torch.float64, 1 << 24))
@@ -158,10 +190,11 @@ class PartModel:
         """Control heights of the part."""
         return scaled(self.heights, guess.scale) + deviation(self.field, guess.modes)
 
-    def landing(self, guess: Guess) -> Landing:
-        """The rays of a part on the screen, by derivatives from the surface that was traced last (`trace`)."""
+    def landing(self, guess: Guess, throw: float = 0.0) -> Landing:
+        """The rays of a part on the screen, `throw` mm farther away, by derivatives from the surface traced last (`trace`)."""
         base = self.designed
         moved = self._moved(guess) + self._beyond
+        moved = moved + throw * self.by_throw if throw else moved
         return Landing(base.x + moved[0], base.y + moved[1], base.power)
 
     def trace(self, guess: Guess) -> None:
@@ -177,9 +210,10 @@ class PartModel:
         local = [(cu * along).sum(1), (su * along).sum(1) / (2 * rx), (cu * (sv @ guess.modes.T)).sum(1) / (2 * ry)]
         return np.einsum("sin,sn->in", self.responses, np.array(local)) + guess.scale * self.by_scale
 
-    def land(self, heights: Tensor) -> Landing:
-        """The rays of a surface on the screen."""
+    def land(self, heights: Tensor, throw: float = 0.0) -> Landing:
+        """The rays of a surface on the screen, which is `throw` farther away, mm."""
         screen, found = self.scene.screen, []
+        screen = replace(screen, z=screen.z + throw * math.copysign(1.0, screen.z)) if throw else screen
         with torch.no_grad():
             for traced in self._tracers:
                 ray = traced.land({EXIT: heights}, screen)[0]
@@ -207,6 +241,20 @@ class PartModel:
         """The rays of the designed surface."""
         return self.land(self.heights)
 
+    def image(self, shape: tuple[int, int]) -> np.ndarray:
+        """E of the designed surface by rays on n x m pixels of the screen, over the mean of all light."""
+        at, edges = self.designed, [np.linspace(-1.0, 1.0, n + 1) for n in shape]
+        light = np.histogram2d(at.x, at.y, edges, weights=at.power)[0]
+        if max(self.spread.reach()) > 0:
+            rx, ry = self.scene.screen.half_size
+            light = fftconvolve(light, self.spread.kernel((2 * rx / shape[0], 2 * ry / shape[1])), mode="same")
+        return light * light.size
+
+    @cached_property
+    def diffraction(self) -> np.ndarray | None:
+        """What waves make of the image by rays, (n, m), None where that is not known."""
+        return None if self.wave is None else self.wave - self.image((self.wave.shape[0], self.wave.shape[1]))
+
     @cached_property
     def responses(self) -> np.ndarray:
         """Derivatives of the landing points (X, Y) by height and by both slopes, (3, 2, N), per mm and per unit."""
@@ -222,6 +270,12 @@ class PartModel:
         """Derivatives of the landing points by the scale of the relief, (2, N)."""
         return self._derivative(self.heights - self.heights.mean(), 1e-4)
 
+    @cached_property
+    def by_throw(self) -> np.ndarray:
+        """Derivatives of the landing points by the distance of the screen, (2, N) per mm."""
+        more, less = (self.land(self.heights, sign * FARTHER) for sign in (1.0, -1.0))
+        return np.nan_to_num(np.array([more.x - less.x, more.y - less.y]) / (2 * FARTHER))
+
     def _derivative(self, shape: Tensor, step: float) -> np.ndarray:
         """Derivative of the landing points by a multiple of a shape, control heights, (2, N)."""
         more, less = (self.land(self.heights + sign * step * shape) for sign in (1.0, -1.0))
@@ -229,15 +283,28 @@ class PartModel:
 
 
 class Grid:
-    """The pixels on which a photograph is compared, n x m over a window of the screen; `smooth`: by how many both are blurred."""
+    """The pixels on which a photograph is compared, n x m over a window of the screen; `smooth`: by how many both are blurred;
+    model: for its image of the source."""
 
-    def __init__(self, shape: tuple[int, int], smooth: float, window: Window = WHOLE):
+    def __init__(self, shape: tuple[int, int], smooth: float, window: Window = WHOLE, model: PartModel | None = None):
         self.shape, self.smooth, self.window = shape, smooth, window
-        self.wide = (shape[0] + 2 * AROUND, shape[1] + 2 * AROUND)
+        self.kernel: np.ndarray | None = None
+        if model is not None and max(model.spread.reach()) > 0:
+            half = model.scene.screen.half_size
+            pixel = [(high - low) * r / n for (low, high), r, n in zip(window, half, shape, strict=True)]
+            self.kernel = model.spread.kernel((pixel[0], pixel[1]))
+        self.around = AROUND + (0 if self.kernel is None else max(self.kernel.shape) // 2)
+        self.wide = (shape[0] + 2 * self.around, shape[1] + 2 * self.around)
 
     def inner(self, image: np.ndarray) -> np.ndarray:
         """An image without what lies around the grid."""
-        return image[..., AROUND:-AROUND, AROUND:-AROUND]
+        return image[..., self.around : -self.around, self.around : -self.around]
+
+    def blurred(self, image: np.ndarray, response: Response) -> np.ndarray:
+        """Sharp images (..., n, m) as the source and the camera blur them."""
+        if self.kernel is not None:
+            image = fftconvolve(image, self.kernel[(None,) * (image.ndim - 2)], mode="same", axes=(-2, -1))
+        return self.smoothed(image, self.sensor_blur(response))
 
     def smoothed(self, image: np.ndarray, blur: float | None = None) -> np.ndarray:
         """Images (..., n, m) blurred by this many pixels, `smooth` unless given."""
@@ -249,12 +316,25 @@ class Grid:
         (low, high), _ = self.window
         return float(np.exp(response.log_blur)) * self.shape[0] / (high - low)
 
+    def sampled(self, image: np.ndarray | None, camera: np.ndarray) -> np.ndarray | float:
+        """An image over the whole screen, as the camera displaces it, on the wide grid; 0 for None."""
+        if image is None:
+            return 0.0
+        places = [
+            low + (np.arange(n) - self.around + 0.5) * (high - low) / k
+            for n, k, (low, high) in zip(self.wide, self.shape, self.window, strict=True)
+        ]
+        x, y = (c.ravel() for c in np.meshgrid(*places, indexing="ij"))
+        moved = np.einsum("k,kin->in", camera, displacements(x, y))
+        at = [(c - d + 1.0) * 0.5 * n - 0.5 for c, d, n in zip((x, y), moved, image.shape, strict=True)]
+        return map_coordinates(image, at, order=1).reshape(self.wide)
+
     def splats(self, landing: Landing, camera: np.ndarray) -> tuple[csc_matrix, csc_matrix, csc_matrix]:
         """Matrices (pixels of the wide grid, N) from powers to E, and from power times displacement along X and Y to its change."""
         moved = np.einsum("k,kin->in", camera, displacements(landing.x, landing.y))
         scale = [n / (high - low) for n, (low, high) in zip(self.shape, self.window, strict=True)]
         seen = landing.x + moved[0], landing.y + moved[1]
-        at = [(c - low) * k - 0.5 + AROUND for c, k, (low, _) in zip(seen, scale, self.window, strict=True)]
+        at = [(c - low) * k - 0.5 + self.around for c, k, (low, _) in zip(seen, scale, self.window, strict=True)]
         middle, inside = [], np.isfinite(at[0] + at[1])
         for c, n in zip(at, self.wide, strict=True):
             c[~inside] = 1.0
@@ -281,11 +361,12 @@ class Grid:
 
 @dataclass(eq=False)
 class Prediction:
-    """The codes (n, m) predicted for a guess, with what their derivatives need."""
+    """The codes (n, m) of a photograph predicted for a guess, with what their derivatives need; view: its unknowns."""
 
     model: PartModel
     grid: Grid
     guess: Guess
+    view: View
     landing: Landing
     splats: tuple[csc_matrix, csc_matrix, csc_matrix]
     #: E on the wide grid, sharp and blurred.
@@ -293,43 +374,44 @@ class Prediction:
     blurred: np.ndarray
 
     @classmethod
-    def of(cls, model: PartModel, grid: Grid, guess: Guess, landing: Landing | None = None) -> Prediction:
-        """The prediction; landing: of the same surface, if it is known already."""
-        landing = model.landing(guess) if landing is None else landing
-        splats = grid.splats(landing, guess.camera)
-        sharp = (splats[0] @ landing.power).reshape(grid.wide)
-        return cls(model, grid, guess, landing, splats, sharp, grid.smoothed(sharp, grid.sensor_blur(guess.response)))
+    def of(cls, model: PartModel, grid: Grid, guess: Guess, number: int = 0, landing: Landing | None = None) -> Prediction:
+        """The prediction of one of the photographs, by its number; landing: of the same surface, if it is known already."""
+        view = guess.views[number]
+        landing = model.landing(guess, view.throw) if landing is None else landing
+        splats = grid.splats(landing, view.camera)
+        sharp = (splats[0] @ landing.power).reshape(grid.wide) + grid.sampled(model.diffraction, view.camera)
+        return cls(model, grid, guess, view, landing, splats, sharp, grid.blurred(sharp, view.response))
 
     @property
     def codes(self) -> np.ndarray:
         """On the grid, smoothed."""
-        return self.grid.inner(self.grid.smoothed(self.guess.response.codes(self.blurred)))
+        return self.grid.inner(self.grid.smoothed(self.view.response.codes(self.blurred)))
 
     def by_response(self) -> np.ndarray:
         """Derivatives of the codes by the four values of the response, (4, n, m)."""
-        r, grid = self.guess.response, self.grid
+        r, grid = self.view.response, self.grid
         by_light, by_gamma = r.slopes(self.blurred)
         step = 1e-2
-        wider = grid.smoothed(self.sharp, grid.sensor_blur(replace(r, log_blur=r.log_blur + step)))
+        wider = grid.blurred(self.sharp, replace(r, log_blur=r.log_blur + step))
         gain = np.exp(r.log_gain)
         stack = [by_light * gain * self.blurred, by_light, by_gamma, by_light * gain * (wider - self.blurred) / step]
         return grid.inner(grid.smoothed(np.array(stack)))
 
     def _of_images(self, images: np.ndarray) -> np.ndarray:
         """Derivatives of the codes (N, n, m) from those of the sharp E, (pixels, N)."""
-        r, grid = self.guess.response, self.grid
-        images = grid.smoothed(np.ascontiguousarray(images.T).reshape(-1, *grid.wide), grid.sensor_blur(r))
+        r, grid = self.view.response, self.grid
+        images = grid.blurred(np.ascontiguousarray(images.T).reshape(-1, *grid.wide), r)
         images *= r.slopes(self.blurred)[0] * np.exp(r.log_gain)
         return grid.inner(grid.smoothed(images))
 
     def by_shape(self) -> Iterator[np.ndarray]:
-        """Derivatives of the codes by the amplitudes c, (9, n, m); by s, (1, n, m); by the modes (k, .), (l, n, m) for each k."""
+        """Derivatives of the codes by c, (9, n, m); by t and s, (2, n, m); by the modes (k, .), (l, n, m) for each k."""
         power, (_, by_x, by_y) = self.landing.power, self.splats
         fields = displacements(self.landing.x, self.landing.y) * power  # (9, 2, N)
         yield self._of_images(by_x @ fields[:, 0].T + by_y @ fields[:, 1].T)
         model, guess = self.model, self.guess
-        dx, dy = model.by_scale
-        yield self._of_images((by_x @ (power * dx) + by_y @ (power * dy))[:, None])
+        dx, dy = np.array([model.by_throw, model.by_scale]).swapaxes(0, 1) * power  # (2, N) each
+        yield self._of_images(by_x @ dx.T + by_y @ dy.T)
         u, v = model.places
         (up, along_x, along_y), (rx, ry), count = model.responses, model.field.half_size, len(guess.modes)
         cu, cv = (cosines(c, count) for c in (u, v))
