@@ -90,13 +90,14 @@ class Exporter:
         scripts = import_module("caustic_cli.export.lighttools_script") if script else None
         arguments = _arguments(format, part)
         file, judged = File(home, arguments, path if format == "heightmap" else None, part), hasattr(home, "readings")
+        more = {key: given.pop(key) for key in getattr(home, "MORE", ()) if key in given}
         choice = given if not judged or {"samples", "tolerance"} & set(given) else self.smallest(file)
-        written = writer(path, *arguments, **choice)
+        written = writer(path, *arguments, **choice, **more)
         if scripts is not None:
             scripts.write_script(path, scene, self.field, self.heights, choice.get("samples"))
         found = self.figures(file, choice, format) if judged else {}
         if written is not None:
-            found["heightmap"] = {key: value for key, value in written.items() if key != "spline"}
+            found[format] = {key: value for key, value in written.items() if key != "spline"}
         return found
 
     def error(self, file: File, choice: dict, key: str | None = None) -> float:

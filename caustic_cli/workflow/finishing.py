@@ -83,8 +83,8 @@ def _rough(scene: Scene, slope: float) -> Scene:
 
 def of_design(lens: Lens, say: Reporter) -> dict[str, Any]:
     """What the correction for the finish of a new design is worth, also said: finish, with steps, the error of the finished part,
-    error_by and noise, weaker_error and stronger_error for the ends of what is known of the steps, uncorrected_error, and
-    relief_um, by how much the surface to be made departs from the designed one; empty without a finish."""
+    error_by and noise, weaker_error and stronger_error for the ends of what is known of the steps, uncorrected_error and its noise,
+    and relief_um, by how much the surface to be made departs from the designed one; empty without a finish."""
     finish = lens.project.settings.lens.finish if lens.project else ""
     if not finish:
         return {}
@@ -93,17 +93,20 @@ def of_design(lens: Lens, say: Reporter) -> dict[str, Any]:
         found, (weaker, stronger) = judged(part.finished()), part.unsure()
     off = deviation(replace(lens, field=lens.made[0], heights=lens.made[1]), lens)["most_um"]
     say.say(
-        f"finished ({finish}), the corrected part has an error of {said(found['error'])} by {found['error_by']}, {said(weaker)} if"
-        f" the steps are weaker than assumed and {said(stronger)} if stronger, by what is not known of them; one made as designed"
-        f" has {said(plain['error'])}; the surface to be made, which is exported, is up to {off:.3g} µm off the designed one"
+        f"finished ({finish}), the corrected part has an error of {said(found['error'], found['noise'])} by {found['error_by']},"
+        f" {said(weaker)} if the steps are weaker than assumed and {said(stronger)} if stronger, by what is not known of them; one"
+        f" made as designed has {said(plain['error'], plain['noise'])}; the surface to be made, which is exported, is up to"
+        f" {off:.3g} µm off the designed one"
     )
-    more = {"weaker_error": weaker, "stronger_error": stronger, "uncorrected_error": plain["error"], "relief_um": off}
+    more = {"weaker_error": weaker, "stronger_error": stronger, "relief_um": off}
+    more |= {"uncorrected_error": plain["error"], "uncorrected_noise": plain["noise"]}
     return {"finish": found | {"steps": finish} | more}
 
 
-def said(error: float | None) -> str:
-    """An error in words; None where light crosses within the lens, so that it has no wave image."""
-    return "unknown (no wave image)" if error is None else f"{error:.4f}"
+def said(error: float | None, noise: float | None = None) -> str:
+    """An error in words, with its standard error where rays leave some; None where light crosses within the lens, so that it has no
+    wave image."""
+    return "unknown (no wave image)" if error is None else f"{error:.4f}" + (f" ± {noise:.2g}" if noise else "")
 
 
 def deviation(lens: Lens, of: Lens) -> dict[str, float]:
@@ -124,7 +127,8 @@ def judged(lens: Lens, rays: float | None = None, **how: Any) -> dict[str, Any]:
     figures = lens.render(rays, **how).figures
     if lens.by_waves:
         figures = {**figures, **lens.render_waves(required=False).figures}
-    return {key: figures.get(key) for key in ("error", "error_by", "noise")}
+    found = {key: figures.get(key) for key in ("error", "error_by", "noise")}
+    return found if found["error_by"] == "rays" else found | {"noise": None}
 
 
 def compared(lens: Lens, finishes: tuple[str, ...] | None = None) -> list[Mapping[str, Any]]:

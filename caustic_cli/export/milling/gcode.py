@@ -25,9 +25,10 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.milling import Milling
+from caustic_cli.export.milling import TURNING, Milling
 from caustic_cli.export.milling.offset import BallOffset, FlatOffset, shape_of
-from caustic_cli.export.milling.paths import raster, spacing, spiral, with_heights
+from caustic_cli.export.milling.paths import batches, raster, spacing, spiral, with_heights
+from caustic_cli.export.milling.turning import write_turning
 from caustic_cli.export.part import Part
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
@@ -40,11 +41,8 @@ from caustic_cli.schema.checks import LENGTH
 PATH_PART, MORE_DIGITS, LEAST_DIGITS = 0.01, 1, 4
 #: Largest overrun of the passes beyond the aperture, over the tool radius.
 MOST_OVER = 0.7
-#: Length of the initial moves of a path over the radius, at most a knot span; initial moves processed at a time, which bounds the
-#: memory.
-FIRST_MOVE, AT_A_TIME = 0.125, 4096
-#: Default least stock above the highest point, mm.
-FACING = 0.1
+#: Length of the initial moves of a path over the radius, at most a knot span.
+FIRST_MOVE = 0.125
 #: Roughing: step-over over the radius, tolerance over the allowance.
 ROUGH_STEP, ROUGH_PART = 0.5, 0.05
 #: mm of an inch.
@@ -133,6 +131,9 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     if tolerance is not None:
         checks.number("⟨tolerance⟩", tolerance, 0.0, LENGTH, open_low=True)
     m, base = milling or Milling(), part.lens.z_in
+    unit, simple = INCH if m.dialect.endswith("inch") else 1.0, m.dialect.startswith("simple")
+    if m.path == TURNING:
+        return write_turning(path, part, m, tolerance, unit, simple)
     field, heights = part.field, part.heights - base  # from here on Z0 is the flat face
     low, high, slope, concave = shape_of(field, heights)
     step = m.step(concave, slope)
@@ -141,9 +142,8 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     step = spacing(m.path, outline, step)
     scallop = m.scallop_of(step, concave, slope)
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
-    unit = INCH if m.dialect.endswith("inch") else 1.0
     digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance / unit)) + MORE_DIGITS)
-    top = _stock(m, high)
+    top = m.top(high)
     dips = low - m.tool_radius + math.sqrt(m.tool_radius**2 - min(2.0 * over * over, 0.99 * m.tool_radius**2))
     if dips < 0.0:
         raise InputError(
@@ -153,7 +153,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
     passes = spiral(outline, step) if m.path == "spiral" else raster(outline, step, lines[m.path])
     with atomic_file(path) as file:
-        out = _Writer(file, digits, unit, m.dialect.startswith("simple"))
+        out = _Writer(file, digits, unit, simple)
         out.say(*_head(part, m, step, scallop, top, digits, tolerance))
         place = file.tell()
         out.say(" " * COUNTED, f"{'G21' if unit == 1.0 else 'G20'} G90 G17 G94")
@@ -211,27 +211,6 @@ def _descend(out: _Writer, to: np.ndarray, top: float, plunge: float) -> None:
     out.cut(to[None], plunge)
 
 
-def _batches(passes: Iterator[np.ndarray], move: float) -> Iterator[np.ndarray]:
-    """Concatenate consecutive passes into lines of about AT_A_TIME initial moves."""
-    held, moves = [], 0.0
-    for line in passes:
-        held.append(line if not held else line[1:])
-        moves += float(np.hypot(*np.diff(line, axis=0).T).sum()) / move
-        if moves > AT_A_TIME:
-            yield np.concatenate(held)
-            held, moves = [line[-1:]], 0.0
-    if sum(map(len, held)) > 1:
-        yield np.concatenate(held)
-
-
-def _stock(m: Milling, high: float) -> float:
-    """Height of the stock, mm, for a surface up to `high` mm."""
-    top = math.ceil((high + FACING) * 10.0) / 10.0 if m.stock is None else m.stock
-    if top < high:
-        raise InputError(f"⟨stock⟩ must reach the surface's highest point, {high:.6g} mm above Z0, got {top:g} mm")
-    return top
-
-
 def _finish(
     out: _Writer, m: Milling, field: HeightField, heights: Tensor, passes: Iterator[np.ndarray], top: float, tolerance: float
 ) -> None:
@@ -239,7 +218,7 @@ def _finish(
     offset, first = BallOffset(field, heights, m.tool_radius), True
     spans = (2.0 * r / (len(s.breaks) - 1) for s, r in zip(field.spaces, field.half_size, strict=True))
     move = min(FIRST_MOVE * m.tool_radius, *spans)
-    for line in _batches(passes, move):
+    for line in batches(passes, move):
         points = with_heights(line, offset, move, tolerance)
         if first:
             _descend(out, points[0], top, m.plunge)

@@ -16,8 +16,8 @@ from caustic_cli.scene import Aperture, CircularAperture
 
 #: Largest deviation of the polygon from a spiral, over the step-over.
 OFF = 0.02
-#: Most bisections of a move.
-HALVINGS = 14
+#: Most bisections of a move; initial moves processed at a time, which bounds the memory.
+HALVINGS, AT_A_TIME = 14, 4096
 
 
 def spacing(path: str, aperture: Aperture, step: float) -> float:
@@ -123,3 +123,16 @@ def with_heights(
     order = np.argsort(place, kind="stable")
     points = np.column_stack([xy, z])[order]
     return points[np.isfinite(points[:, 2])]
+
+
+def batches(passes: Iterator[np.ndarray], move: float) -> Iterator[np.ndarray]:
+    """Concatenate consecutive passes into lines of about AT_A_TIME initial moves."""
+    held, moves = [], 0.0
+    for line in passes:
+        held.append(line if not held else line[1:])
+        moves += float(np.hypot(*np.diff(line, axis=0).T).sum()) / move
+        if moves > AT_A_TIME:
+            yield np.concatenate(held)
+            held, moves = [line[-1:]], 0.0
+    if sum(map(len, held)) > 1:
+        yield np.concatenate(held)

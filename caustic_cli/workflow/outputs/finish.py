@@ -73,7 +73,8 @@ class FinishedPart(Output):
         if f := figures.get("finish"):
             rows = []
             if f["nominal_error"] is not None:
-                error = f"{finishing.said(figures['error'])} by {figures['error_by']}; as designed {f['nominal_error']:.4f}"
+                error = f"{finishing.said(figures['error'], figures['noise'] if figures['error_by'] == 'rays' else None)} by {figures['error_by']}"
+                error += f"; as designed {finishing.said(f['nominal_error'], f['nominal_noise'])}"
                 unsure = f"weaker ones {finishing.said(f['weaker_error'])}; stronger ones {finishing.said(f['stronger_error'])}"
                 rows += [("relative RMS error", error), ("steps known to a factor", unsure)]
             rough = (
@@ -94,7 +95,7 @@ def _words(row: dict[str, Any]) -> str:
     slopes = f"slopes off by RMS {row['slope_rms']:.2g}"
     if row["error_by"] is None or row.get("low", 0.0) is None:
         return slopes
-    error = f"{finishing.said(row['error'])} by {row['error_by']}"
+    error = f"{finishing.said(row['error'], row.get('noise'))} by {row['error_by']}"
     if "low" not in row:
         return error
     rough = f", scatters {row['scattered']:.0%} of the light" if row["scattered"] > FEW else ""
