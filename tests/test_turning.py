@@ -1,11 +1,13 @@
 """Programs for lathes with a tool servo: the surface that the edge leaves, and the room of the flank, anew from the blocks."""
 
+import json
 import re
 import shlex
 
 import numpy as np
 import pytest
 import torch
+from helpers import write_blob
 from test_export import make
 from test_machine import at, spline
 
@@ -16,6 +18,7 @@ from caustic_cli.export.milling import Milling
 from caustic_cli.export.milling.gcode import write_gcode
 from caustic_cli.export.milling.turning import Blank
 from caustic_cli.export.part import part_of
+from caustic_cli.workflow.machining import cut_surface, form_deviation
 
 BLOCK = re.compile(r"^G1 X(\S+) C(\S+) Z(\S+) F(\S+)$", re.MULTILINE)
 
@@ -80,6 +83,38 @@ def test_compensation_is_of_each_section(tmp_path):
     inside = x < 3.5
     plain = at(*lens[1:], *(x * f(np.radians(c)) for f in (np.cos, np.sin)))[inside]
     assert np.abs(z[inside] - plain).max() > 5e-3
+
+
+@pytest.mark.parametrize("dialect", ["mm", "simple-inch"])
+def test_the_simulated_cut_is_that_of_the_arcs(tmp_path, dialect):
+    """As `render --cut` traces it: heights as above, slopes as their differences."""
+    lens = make(control=(16, 13), size=(10.0, 8.0), relief=0.02)
+    how = {"path": "turning", "tool_radius": 0.5, "scallop": 5e-4, "dialect": dialect}
+    write_gcode(tmp_path / "a.nc", part_of("gcode", *lens), Milling(**how))
+    whole, rows = cut_surface(tmp_path / "a.nc", *lens[:2]), blocks(tmp_path / "a.nc", 25.4 if dialect == "simple-inch" else 1.0)
+    assert (whole.base, whole.turned) == (lens[0].lens.z_in, False)
+    rng = np.random.default_rng(4)
+    for angle in (10.0, 77.0, 200.0):
+        rho = rng.uniform(0.001, 3.9, 300)
+        x, y = rho * np.cos(np.radians(angle)), rho * np.sin(np.radians(angle))
+        z, gx, gy = whole.heights_and_slopes(x, y)
+        assert np.abs(z - whole.base - cut(rows, angle, rho, 0.5)).max() < 1e-9
+        for moved, g in (((x + 1e-6, y), gx), ((x, y + 1e-6), gy)):
+            off = np.abs((whole.heights_and_slopes(*moved)[0] - z) / 1e-6 - g)[rho > 0.05]
+            assert np.median(off) < 1e-4 and (off < 1e-3).mean() > 0.98  # but at cusps and ends of blocks
+    f = form_deviation(whole, *lens[1:], lens[0].lens.opening)
+    assert f["cut_gouge_mm"] < 1.5e-4 and 4e-4 < f["cut_left_mm"] < 6.5e-4
+
+
+def test_programs_that_no_lathe_cuts_are_refused(tmp_path):
+    head = "(tool: round nose, radius 1 mm, no rake)\nG21\n"
+    (tmp_path / "a.nc").write_text(head + "G1 X5 C0 Z1\nX4 C10\nX5 C20\n")
+    lens = make(control=(8, 8), relief=0.005)
+    with pytest.raises(InputError, match="towards the axis"):
+        cut_surface(tmp_path / "a.nc", *lens[:2])
+    (tmp_path / "a.nc").write_text("(tool: ball nose, radius 1 mm)\nG1 X5 C0 Z1\n")
+    with pytest.raises(InputError, match="C is not read"):
+        cut_surface(tmp_path / "a.nc", *lens[:2])
 
 
 def flank_room(path, lens, radius, clearance, rows=2000):
@@ -156,3 +191,21 @@ def test_what_a_lathe_cannot_do_is_refused(tmp_path, monkeypatch, capfd, options
     assert cli.run(shlex.split(f"export lens.npz --format gcode -o a.nc {options}")) == 2
     err = capfd.readouterr().err
     assert words in err and err.count("\n") == 1
+
+
+def test_the_command_says_what_lathe_is_needed(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    write_blob()
+    order = "design blob.png --mag 2 --resolution 24 --waves off --rays 20000 --lens-size 4 -o a.caustic -q"
+    assert cli.run(shlex.split(order)) == 0
+    capfd.readouterr()
+    assert cli.run(shlex.split("export a.caustic --format gcode --path turning --scallop 0.005")) == 0
+    out = capfd.readouterr().out
+    assert re.search(r"turns of a blank of 6\.\d+ mm; clearance above .* degrees; Z up to .* mm/s and .* m/s", out)
+    assert cli.run(shlex.split("export a.caustic --format gcode --path turning --scallop 0.005 --force --json")) == 0
+    found = json.loads(capfd.readouterr().out)["milling"]
+    assert found["turns"] == found["minutes"] * 60 and "blur_mm" in found
+    assert cli.run(shlex.split("export a.caustic --format gcode --path turning --clearance 0.1 -o b.nc")) == 2
+    assert "--clearance must exceed" in capfd.readouterr().err and not (tmp_path / "b.nc").exists()
+    assert cli.run(shlex.split("export a.caustic --format gcode --scallop 0.01 -o c.nc")) == 0
+    assert "lathe" not in capfd.readouterr().out

@@ -156,6 +156,8 @@ def run(asked: ExportOptions) -> None:
             say.result(f"{file}: {Path(file).stat().st_size:,} bytes")
         if advice := figures.get(name, {}).get("advice"):
             say.result(advice)
+        if register := figures.get("register"):
+            say.result(_register_words(register))
         if "milling" in figures:
             from caustic_cli.studies.scallops import rows  # noqa: PLC0415
 
@@ -242,6 +244,16 @@ def _given(asked: ExportOptions, formats: list[str]) -> dict[str, Any]:
         "milling": asked.milling or None,
     }
     return {name: value for name, value in given.items() if value is not None}
+
+
+def _register_words(register: dict[str, Any]) -> str:
+    """The register of both sides of a lens in a line."""
+    wide, high, thick = register["stock_mm"]
+    pins = " and ".join(f"{x:g}" for x, _ in register["pins_mm"])
+    return (
+        f"both sides in a stock of {wide:.4g} x {high:.4g} x {thick:g} mm, turned over about x on pins of"
+        f" {register['pin_diameter_mm']:g} mm at x = {pins}, y = 0"
+    )
 
 
 def _printer(text: str) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from caustic_cli.errors import InputError
 from caustic_cli.optics import finishing
 from caustic_cli.optics.finishing import Relief
 from caustic_cli.optics.scattering import scattered
@@ -19,8 +20,10 @@ from caustic_cli.workflow.machining import cut_surface
 from caustic_cli.workflow.reporter import Reporter
 
 #: Finishes of `compared`, the coarsest first.
-LADDER = ("sanded:400,800,2000+polished:5", "sanded:2000+polished:5", "polished:20", "polished:5", "polished:1")
-LADDER += ("coated:50", "coated:20", "coated:5")
+LADDER = ("sanded:400,800,2000+polished:5", "sanded:2000+polished:5", "polished:20", "polished:5", "polished:1", "polished:0.2")
+LADDER += ("coated:20", "coated:5", "coated:1", "printed:25,50", "printed:25,50,20")
+#: Errors, in errors of the lens as designed, for which the finishes that keep them are named.
+KEPT = (1.2, 1.5, 2.0, 4.0)
 #: Points along each axis at which surfaces are compared.
 SURVEY = 301
 
@@ -70,7 +73,9 @@ class Workpiece:
         return scattered(finishing.roughness(self.steps).height, abs(scene.lens.effective_index - 1.0), scene.light.mean)
 
     def unsure(self, **how: Any) -> list[float | None]:
-        """Errors for weaker and for stronger steps; how: arguments of `judged`."""
+        """Errors for weaker and for stronger steps, none if they are known; how: arguments of `judged`."""
+        if all(step.by(1.0) == step for step in self.steps):
+            return []
         return [judged(self.finished(strength), **how)["error"] for strength in (-1.0, 1.0)]
 
 
@@ -90,7 +95,8 @@ def of_design(lens: Lens, say: Reporter) -> dict[str, Any]:
         return {}
     with say.notify_if_slow("tracing the finished part"):
         part, plain = Workpiece(lens, finish), judged(Workpiece(lens, finish, corrected=False).finished())
-        found, (weaker, stronger) = judged(part.finished()), part.unsure()
+        found = judged(part.finished())
+        weaker, stronger = part.unsure() or (found["error"], found["error"])
     off = deviation(replace(lens, field=lens.made[0], heights=lens.made[1]), lens)["most_um"]
     say.say(
         f"finished ({finish}), the corrected part has an error of {said(found['error'], found['noise'])} by {found['error_by']},"
@@ -134,13 +140,27 @@ def judged(lens: Lens, rays: float | None = None, **how: Any) -> dict[str, Any]:
 def compared(lens: Lens, finishes: tuple[str, ...] | None = None) -> list[Mapping[str, Any]]:
     """The lens as designed, and each finish, those of LADDER unless given, with its error and those for the weaker and the stronger
     end of what is known of it: finish, error, low, high, error_by, slope_rms, and scattered, the fraction of light that roughness
-    scatters."""
+    scatters; or why, where the lens cannot be finished so."""
     rows: list[Mapping[str, Any]] = [{"finish": "as designed", **judged(lens), "slope_rms": 0.0, "scattered": 0.0}]
     for finish in finishes or LADDER:
         part = Workpiece(lens, finish)
-        now = part.finished()
+        try:
+            now = part.finished()
+        except InputError as error:
+            rows.append({"finish": finish, "error": None, "error_by": None, "why": str(error)})
+            continue
         figures = judged(now)
         errors = sorted(e for e in (figures["error"], *part.unsure()) if e is not None) or [None]
         more = {"low": errors[0], "high": errors[-1], "slope_rms": deviation(now, lens)["slope_rms"]}
         rows.append({"finish": finish, **figures, **more, "scattered": part.scattered})
     return rows
+
+
+def needed(rows: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Which finishes keep which error, of rows of `compared`: error, the limit, over, in errors of the lens as designed, and
+    finishes, those that stay below it even at the worse end of what is known of them."""
+    own = rows[0]["error"]
+    if own is None:
+        return []
+    kept = [[row["finish"] for row in rows[1:] if (row.get("high") or math.inf) <= over * own] for over in KEPT]
+    return [{"error": over * own, "over": over, "finishes": names} for over, names in zip(KEPT, kept, strict=True)]

@@ -57,6 +57,7 @@ class Milling:
     plunge: float = _setting(200.0, "Feed straight down.", "mm/min")
     spindle: float = _setting(20000.0, "Spindle speed.", "1/min")
     safe_height: float = _setting(5.0, "Height above the stock of moves between cuts.", "mm", 1e4)
+    pin: float = _setting(3.0, "Lens with two free-form sides: diameter of the dowel pins beside it.", "mm", 100.0)
     clearance: float = _setting(10.0, "turning: Clearance angle of the tool.", "deg", 89.0)
     revolutions: float = _setting(60.0, "turning: Speed of the part.", "1/min")
     stock: float | None = _setting(

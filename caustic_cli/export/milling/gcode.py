@@ -29,7 +29,7 @@ from caustic_cli.export.milling import TURNING, Milling
 from caustic_cli.export.milling.offset import BallOffset, FlatOffset, shape_of
 from caustic_cli.export.milling.paths import batches, raster, spacing, spiral, with_heights
 from caustic_cli.export.milling.turning import write_turning
-from caustic_cli.export.part import Part
+from caustic_cli.export.part import Part, Register
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -45,6 +45,8 @@ MOST_OVER = 0.7
 FIRST_MOVE = 0.125
 #: Roughing: step-over over the radius, tolerance over the allowance.
 ROUGH_STEP, ROUGH_PART = 0.5, 0.05
+#: Depth of the holes for pins, in their diameters, and what is left below them at least, in parts of the stock.
+HOLE, FLOOR = 3.0, 0.1
 #: mm of an inch.
 INCH = 25.4
 #: Rapid feed for the estimated time, mm/min: mills have 3 to 30 m/min.
@@ -150,6 +152,11 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
             f"the tool would go {-dips:.3g} mm below the flat face at the edges: a thicker part (⟨lens.min_thickness⟩, ⟨block⟩), a"
             " larger tool or finer scallops keep it above"
         )
+    if part.register is not None and part.register.rim < 2.0 * (low - dips):
+        raise InputError(
+            f"the tools of both sides would meet beside the lens, whose edge is {part.register.rim:.3g} mm thick: a thicker lens"
+            " (⟨lens.thickness⟩), smaller tools or finer scallops keep it in its stock"
+        )
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
     passes = spiral(outline, step) if m.path == "spiral" else raster(outline, step, lines[m.path])
     with atomic_file(path) as file:
@@ -157,6 +164,8 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
         out.say(*_head(part, m, step, scallop, top, digits, tolerance))
         place = file.tell()
         out.say(" " * COUNTED, f"{'G21' if unit == 1.0 else 'G20'} G90 G17 G94")
+        if part.register is not None and not part.turned:
+            _drill(out, m, part.register, safe)
         if m.roughing is not None:
             _begin(out, m.roughing_tool, m.rough_radius, m.spindle, safe)
             _rough(out, m, field, heights, part.lens.opening, top, low, safe)
@@ -182,13 +191,14 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
 
 def _head(part: Part, m: Milling, step: float, scallop: float, top: float, digits: int, tolerance: float) -> list[str]:
     """Header comments: part, tools and datum.  `io.gcode` reads those with a colon."""
-    wide, high = part.lens.size
+    wide, high = part.lens.size if part.register is None else (part.register.wide, part.register.high)
     turned = "yes, the scene's x, y, z is x, -y, -z here" if part.turned else "no"
     return [
         f"({CREATED})",
         f"(part: {part.kind})",
         f"(turned: {turned})",
-        f"(Z0: {part.lens.z_in:.17g} mm is its z in the other formats; the flat face, on the table)",
+        f"(Z0: {part.lens.z_in:.17g} mm is its z in the other formats; {part.face}, on the table)",
+        *([] if part.register is None else part.register.said(part.turned)),
         "(X0 Y0: the middle of the part; X Y Z are of the tool's tip)",
         f"(stock: {wide:g} x {high:g} x {top:g} mm, top at Z{top:g})",
         f"(finishing: {m.path}, step-over {step:.6g} mm, scallops up to {scallop:.3g} mm, moves within {tolerance:.3g} mm)",
@@ -196,8 +206,18 @@ def _head(part: Part, m: Milling, step: float, scallop: float, top: float, digit
     ]
 
 
+def _drill(out: _Writer, m: Milling, register: Register, safe: float) -> None:
+    """Write the holes for the dowel pins, from above, not through the stock."""
+    _begin(out, "drill", 0.5 * register.pin, m.spindle, safe)
+    for x in register.pins:
+        depth = min(HOLE * register.pin, (1.0 - FLOOR) * register.thickness)
+        _descend(out, np.array([x, 0.0, register.thickness - depth]), register.thickness, m.plunge)
+        out.rapid(z=safe)
+    out.say("M5", "M0 (change the tool)")
+
+
 def _begin(out: _Writer, tool: str, radius: float, spindle: float, safe: float) -> None:
-    name = "ball nose" if tool == "ball" else "flat end"
+    name = {"ball": "ball nose", "flat": "flat end"}.get(tool, tool)
     out.say(f"(tool: {name}, radius {radius:.17g} mm)", f"M3 S{spindle:g}")
     out.rapid(z=safe)
     out.feed = 0.0
