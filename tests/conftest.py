@@ -45,6 +45,7 @@ SLOW = (
     "test_effects_cli.py",
     "test_extended.py",
     "test_extending.py",
+    "test_finish_models.py",
     "test_guide.py",
     "test_intersection.py",
     "test_irradiance.py",
@@ -71,6 +72,8 @@ SLOW = (
     "test_stages.py",
     "test_system.py",
     "test_tolerances.py",
+    "test_turning.py",
+    "test_two_setups.py",
     "test_verify.py",
 )
 
@@ -101,6 +104,7 @@ LONG = (
     "test_files_of_one_index_have_that_of_the_one_wavelength",
     "test_an_addition_touches_few_files",
     "test_no_correction_makes_a_part_worse",
+    "test_the_simulated_cut_is_that_of_the_arcs[simple-inch]",
     "test_corners_and_the_picture_itself_find_the_screen_too",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.001-0.05-1]",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.003-0.25-3]",

@@ -4,7 +4,8 @@ Notation
     C           angle of the tool around the axis, radians, increasing;  X, Z  of the lowest point of the nose, mm, linear in C
     R           radius of the nose, mm;  rho, theta  polar coordinates of a point of the surface
 
-In the section at theta the nose stands at C = theta + 2 pi k with X(C), and across the axis at C = theta + pi + 2 pi k with -X(C):  z = Z + R - sqrt(R^2 - (rho -+ X)^2), the least over k.  The turns must approach the axis steadily.
+In the section at theta the nose stands at C = theta + 2 pi k with X(C), and across the axis at C = theta + pi + 2 pi k with -X(C):
+z = Z + R - sqrt(R^2 - (rho -+ X)^2), the least over k.  The turns must approach the axis steadily.
 """
 
 from __future__ import annotations

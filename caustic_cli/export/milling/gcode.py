@@ -146,17 +146,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
     digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance / unit)) + MORE_DIGITS)
     top = m.top(high)
-    dips = low - m.tool_radius + math.sqrt(m.tool_radius**2 - min(2.0 * over * over, 0.99 * m.tool_radius**2))
-    if dips < 0.0:
-        raise InputError(
-            f"the tool would go {-dips:.3g} mm below the flat face at the edges: a thicker part (⟨lens.min_thickness⟩, ⟨block⟩), a"
-            " larger tool or finer scallops keep it above"
-        )
-    if part.register is not None and part.register.rim < 2.0 * (low - dips):
-        raise InputError(
-            f"the tools of both sides would meet beside the lens, whose edge is {part.register.rim:.3g} mm thick: a thicker lens"
-            " (⟨lens.thickness⟩), smaller tools or finer scallops keep it in its stock"
-        )
+    _refuse_deep(part, low, m.tool_radius - math.sqrt(m.tool_radius**2 - min(2.0 * over * over, 0.99 * m.tool_radius**2)))
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
     passes = spiral(outline, step) if m.path == "spiral" else raster(outline, step, lines[m.path])
     with atomic_file(path) as file:
@@ -187,6 +177,24 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
         "tolerance_mm": tolerance,
         "stock_mm": top,
     }
+
+
+def _refuse_deep(part: Part, low: float, deeper: float) -> None:
+    """Refuse a part beside whose edges, at least `low` mm high, the tool goes deeper by so much, mm.
+
+    Raises:
+        InputError: it would cut into the table, or meet that of the other side.
+    """
+    if low < deeper:
+        raise InputError(
+            f"the tool would go {deeper - low:.3g} mm below the flat face at the edges: a thicker part (⟨lens.min_thickness⟩,"
+            " ⟨block⟩), a larger tool or finer scallops keep it above"
+        )
+    if part.register is not None and part.register.rim < 2.0 * deeper:
+        raise InputError(
+            f"the tools of both sides would meet beside the lens, whose edge is {part.register.rim:.3g} mm thick: a thicker lens"
+            " (⟨lens.thickness⟩), a larger tool or finer scallops keep it in its stock"
+        )
 
 
 def _head(part: Part, m: Milling, step: float, scallop: float, top: float, digits: int, tolerance: float) -> list[str]:

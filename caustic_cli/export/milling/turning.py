@@ -48,6 +48,8 @@ A_TURN, A_SPAN, MOST, STEPS = 64, 4, 129, 8
 #: Tolerance of moves over the height of cusps: with the slope sqrt(2 t k) at their ends, for a curvature k along the turn far below
 #: that of the nose, an eighth of that of cusps or less.
 PATH_PART = 0.25
+#: Parts of a move at which it is compared beside its middle: at a corner of the part the surface bends within a fraction of a span.
+PROBES = (0.25, 0.75)
 #: Points at a time.
 AT_A_TIME = 1 << 19
 #: Factor for slopes between samples; radii and angles at which slopes are sampled; lengths of chords, mm.
@@ -197,9 +199,9 @@ def write_turning(path: str | Path, part: Part, m: Milling, tolerance: float | N
     with atomic_file(path) as file:
         out = _Writer(file, m, unit, simple, top, *_digits(tolerance / unit, moved["needed"], outer / unit))
         out.say(*_head(part, m, moved, 2.0 * outer, top, feed, scallop, tolerance))
-        move = min(2.0 * math.pi / A_TURN, blank.span / outer)
+        move = min(2.0 * math.pi / A_TURN, 0.5 * blank.span / outer)
         for line in batches(spiral(turns, feed), move):
-            out.cut(with_heights(line, offset, move, tolerance))
+            out.cut(with_heights(line, offset, move, tolerance, PROBES))
         out.end()
     return {
         "lines": out.lines,
