@@ -104,6 +104,7 @@ LONG = (
     "test_files_of_one_index_have_that_of_the_one_wavelength",
     "test_an_addition_touches_few_files",
     "test_no_correction_makes_a_part_worse",
+    "test_a_corrected_part_is_better_by_the_stated_amount",
     "test_the_simulated_cut_is_that_of_the_arcs[simple-inch]",
     "test_corners_and_the_picture_itself_find_the_screen_too",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.001-0.05-1]",

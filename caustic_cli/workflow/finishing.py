@@ -24,6 +24,8 @@ LADDER = ("sanded:400,800,2000+polished:5", "sanded:2000+polished:5", "polished:
 LADDER += ("coated:20", "coated:5", "coated:1", "printed:25,50", "printed:25,50,20")
 #: Errors, in errors of the lens as designed, for which the finishes that keep them are named.
 KEPT = (1.2, 1.5, 2.0, 4.0)
+#: Slope off the designed one beyond which a point is of the riser of a step, through which no light is refracted.
+RISER = 1.0
 #: Points along each axis at which surfaces are compared.
 SURVEY = 301
 
@@ -116,15 +118,15 @@ def said(error: float | None, noise: float | None = None) -> str:
 
 
 def deviation(lens: Lens, of: Lens) -> dict[str, float]:
-    """By how much a surface differs from another beside piston, for JSON: rms_um, most_um, and slope_rms."""
+    """By how much a surface differs from another beside piston, for JSON: rms_um, most_um, and slope_rms, without risers."""
     line = [torch.linspace(-r, r, SURVEY, dtype=torch.float64) * (1.0 - 1e-9) for r in of.field.half_size]
     x, y = (c.reshape(-1) for c in torch.meshgrid(*line, indexing="ij"))
     z, gx, gy = (a - b for a, b in zip(lens.field.at(lens.heights, x, y), of.field.at(of.heights, x, y), strict=True))
-    off = 1e3 * (z - z.mean())
+    off, steep = 1e3 * (z - z.mean()), torch.hypot(gx, gy)
     return {
         "rms_um": float(off.std()),
         "most_um": float(off.abs().max()),
-        "slope_rms": float(torch.hypot(gx, gy).square().mean().sqrt()),
+        "slope_rms": float(steep[steep < RISER].square().mean().sqrt()),
     }
 
 
