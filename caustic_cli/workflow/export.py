@@ -110,7 +110,7 @@ class Exporter:
         if format == "gcode":
             found, back = (home.write_gcode(p, s, with_stock(m, s), **given) for p, s in zip(paths, sides, strict=True))
             return {"milling": found | _scallops(scene, self.field, found), "entrance": back, "register": sides[0].register.figures}
-        file = Sides(home, (sides[0],), path, sides[0], other=File(home, (sides[1],), paths[1], sides[1]), scene=scene)
+        file = BothSides(home, (sides[0],), path, sides[0], other=File(home, (sides[1],), paths[1], sides[1]), scene=scene)
         choice = given or self.smallest(file)
         for p, s in zip(paths, sides, strict=True):
             said = home.write_heightmap(p, s, **choice)
@@ -233,7 +233,7 @@ class File:
 
 
 @dataclass(frozen=True, eq=False)
-class Sides(File):
+class BothSides(File):
     """The exit of a lens with two free-form sides; other: its entrance; read together."""
 
     other: File = field(kw_only=True)
@@ -245,7 +245,7 @@ class Sides(File):
         def both() -> Reading:
             entrance, heights = self.other.in_the_scene(self.other.readings(choice)["error"]())
             assert isinstance(entrance, HeightField) and heights is not None
-            exit_side = super(Sides, self).readings(choice)["error"]()
+            exit_side = super(BothSides, self).readings(choice)["error"]()
             return replace(exit_side, entrance=freeform_of(entrance, heights - self.scene.lens.z_in))
 
         return {"error": both}

@@ -197,7 +197,7 @@ def write_turning(path: str | Path, part: Part, m: Milling, tolerance: float | N
         )
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
     with atomic_file(path) as file:
-        out = _Writer(file, m, unit, simple, top, *_digits(tolerance / unit, moved["needed"], outer / unit))
+        out = _LatheWriter(file, m, unit, simple, top, *_digits(tolerance / unit, moved["needed"], outer / unit))
         out.say(*_head(part, m, moved, 2.0 * outer, top, feed, scallop, tolerance))
         move = min(2.0 * math.pi / A_TURN, 0.5 * blank.span / outer)
         for line in batches(spiral(turns, feed), move):
@@ -229,7 +229,7 @@ def _digits(tolerance: float, needed: float, radius: float) -> tuple[int, int]:
 
 
 @dataclass
-class _Writer:
+class _LatheWriter:
     """Writes blocks and counts lines and length, mm; digits of X and Z in the unit of the program, and of C."""
 
     file: Any
