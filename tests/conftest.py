@@ -45,6 +45,7 @@ SLOW = (
     "test_effects_cli.py",
     "test_extended.py",
     "test_extending.py",
+    "test_finish_models.py",
     "test_guide.py",
     "test_intersection.py",
     "test_irradiance.py",
@@ -71,6 +72,8 @@ SLOW = (
     "test_stages.py",
     "test_system.py",
     "test_tolerances.py",
+    "test_turning.py",
+    "test_two_setups.py",
     "test_verify.py",
 )
 
@@ -103,6 +106,8 @@ LONG = (
     "test_no_correction_makes_a_part_worse",
     "test_parts_in_other_light_and_mirrors_are_judged_too",
     "test_photographs_at_two_throws_tell_the_scale_of_the_relief_from_the_throw",
+    "test_a_corrected_part_is_better_by_the_stated_amount",
+    "test_the_simulated_cut_is_that_of_the_arcs[simple-inch]",
     "test_corners_and_the_picture_itself_find_the_screen_too",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.001-0.05-1]",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.003-0.25-3]",

@@ -210,7 +210,7 @@ def test_design_render_resume_and_files(_here, capfd):
         files = {"--tolerances": ["t.toml"], "--html": ["page.html"]}.get(study, [])
         Path("t.toml").write_text("[index]\nsigma = 0.001\n")
         assert "entrance" in run(capfd, "render", "p", study, *files, "--quiet", "--force", code=2), study
-    assert "holds one free-form side" in run(capfd, "export", "p", "--format", "gcode", code=2)
+    assert "holds one free-form side" in run(capfd, "export", "p", "--format", "zemax", code=2)
 
 
 def test_the_image_changes_with_a_height_of_the_exit_as_differences_say(_here, capfd):

@@ -10,8 +10,9 @@ import typer
 
 from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError, alternatives
-from caustic_cli.export import FORMATS, MOST_BYTES, MOULDS, UNSAMPLED, WITHIN, format_of
-from caustic_cli.export.milling import Milling
+from caustic_cli.export import FORMATS, MOST_BYTES, MOULDS, ORIENTATIONS, UNSAMPLED, WITHIN, format_of
+from caustic_cli.export.milling import MILLED, TURNED, TURNING, Milling
+from caustic_cli.schema import checks
 
 EXAMPLES = """Examples:
 
@@ -30,6 +31,8 @@ TAKERS: dict[str, Sequence[str]] = {
     "max_size": [name for name in FORMATS if name not in ("phase", "gcode")],
     "levels": ("phase",),
     "script": ("lighttools",),
+    "printer": ("3mf",),
+    "orientation": ("3mf",),
     "milling": ("gcode",),
 }
 
@@ -99,6 +102,21 @@ class ExportOptions(options.OfDesign, options.Debugging):
             help="phase: values of the phase in a turn, 2 to 65536, as of a modulator or of etched steps.  [default: 65536]",
         ),
     ] = None
+    printer: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAYER,PLANE",
+            help="3mf: Layers of the printer and the least step in their plane, µm, by which an orientation is advised.  [default:"
+            " 50,50]",
+        ),
+    ] = None
+    orientation: Annotated[
+        str | None,
+        typer.Option(
+            metavar="advised|up|edge-x|edge-y",
+            help="3mf: How the part stands on the plate.  [default: as in the scene, with the advice in its metadata]",
+        ),
+    ] = None
     milling: Annotated[dict[str, Any], options.FieldOptions(Milling)]
     script: Annotated[
         bool,
@@ -136,6 +154,10 @@ def run(asked: ExportOptions) -> None:
         say.result(f"{figures['file']}: {figures['bytes']:,} bytes{f', {words}' if words else ''}")
         for file in figures.get("beside", ()):
             say.result(f"{file}: {Path(file).stat().st_size:,} bytes")
+        if advice := figures.get(name, {}).get("advice"):
+            say.result(advice)
+        if register := figures.get("register"):
+            say.result(_register_words(register))
         if "milling" in figures:
             from caustic_cli.studies.scallops import rows  # noqa: PLC0415
 
@@ -209,15 +231,37 @@ def _given(asked: ExportOptions, formats: list[str]) -> dict[str, Any]:
     _check_milling(asked.milling)
     if asked.max_size is not None and (asked.samples is not None or asked.tolerance is not None):
         raise InputError("--max-size chooses the points itself: give it without --samples and --tolerance")
+    if asked.orientation is not None:
+        checks.choice("--orientation", asked.orientation, ("advised", *ORIENTATIONS))
     given = {
         "mould": asked.mould or None,
         "block": asked.block,
         "samples": tuple(options.both(options.counts("--samples", asked.samples))) if asked.samples else None,
         "tolerance": asked.tolerance,
         "levels": asked.levels,
+        "printer": _printer(asked.printer) if asked.printer else None,
+        "orientation": asked.orientation,
         "milling": asked.milling or None,
     }
     return {name: value for name, value in given.items() if value is not None}
+
+
+def _register_words(register: dict[str, Any]) -> str:
+    """The register of both sides of a lens in a line."""
+    wide, high, thick = register["stock_mm"]
+    pins = " and ".join(f"{x:g}" for x, _ in register["pins_mm"])
+    return (
+        f"both sides in a stock of {wide:.4g} x {high:.4g} x {thick:g} mm, turned over about x on pins of"
+        f" {register['pin_diameter_mm']:g} mm at x = {pins}, y = 0"
+    )
+
+
+def _printer(text: str) -> tuple[float, float]:
+    """Layer and step in its plane, mm, from µm."""
+    layer, plane = options.numbers("--printer", text, (2,), ",", "two lengths in µm, like 50,35")
+    if not all(0.1 <= length <= 1000.0 for length in (layer, plane)):
+        raise InputError(f"--printer must be two lengths from 0.1 to 1000 µm, got {text!r}")
+    return 1e-3 * layer, 1e-3 * plane
 
 
 def _check_takers(asked: ExportOptions, formats: list[str]) -> None:
@@ -236,6 +280,12 @@ def _check_milling(given: dict[str, Any]) -> None:
     rough = [name for name in given if name in ("roughing_tool", "roughing_radius", "allowance")]
     if rough and "roughing" not in given:
         raise InputError(f"--{rough[0].replace('_', '-')} belongs to --roughing, which is not given")
+    turns = given.get("path") == TURNING
+    if others := [name for name in given if name in (MILLED if turns else TURNED)]:
+        option = f"--{others[0].replace('_', '-')}"
+        raise InputError(
+            f"{option} belongs to {'another --path' if turns else '--path turning'}, got {given.get('path', 'raster')}"
+        )
     if "scallop" in given and "step_over" in given:
         raise InputError("--scallop and --step-over both say how far passes are apart: give one of them")
     Milling(**given)

@@ -28,6 +28,8 @@ SOLIDS, AS_CUT = ("step", "stl", "ply", "obj", "3mf"), ("heightmap", "gcode")
 MOULDS = (*SOLIDS, *AS_CUT)
 #: Formats with a tolerance, and formats without samples.
 WITHIN, UNSAMPLED = (*MESHES, "lighttools", "step", "heightmap", "gcode"), ("step", "gcode")
+#: How a part stands on a printer's plate: face up, or on edge with x or y upright.
+ORIENTATIONS = ("up", "edge-x", "edge-y")
 #: Default limit of the file size, bytes.
 MOST_BYTES = 100_000_000
 #: Formats among which one that keeps the picture is looked for where another does not.

@@ -171,26 +171,30 @@ def _said(part: Part, counts: Counts, name: str) -> dict:
         "knots_u": field.spaces[0].knots.tolist(),
         "knots_v": field.spaces[1].knots.tolist(),
     }
-    return {
-        "created_by": SOFTWARE,
-        "height_map": VERSION,
-        "file": name,
-        "part": part.kind,
-        "unit": "mm",
-        "columns": nx,
-        "rows": ny,
-        "mm_per_column": 2.0 * rx / (nx - 1),
-        "mm_per_row": 2.0 * ry / (ny - 1),
-        "x_of_column_0": -rx,
-        "y_of_row_0": ry,
-        "orientation": "seen from +z: columns run along +x, rows along -y; pixels are points, borders included",
-        "z_of_zero": counts.low,
-        "mm_per_count": counts.scale,
-        "quantum_mm": counts.quantum,
-        "z_least": counts.low,
-        "z_most": counts.high,
-        "z_of_flat_face": part.lens.z_in,
-        "turned": part.turned,
-        "to_the_scene": "(x, -y, -z)" if part.turned else "(x, y, z)",
-        "round": part.lens.opening.round,
-    } | ({"spline": spline} if enough else {})
+    return (
+        {
+            "created_by": SOFTWARE,
+            "height_map": VERSION,
+            "file": name,
+            "part": part.kind,
+            "unit": "mm",
+            "columns": nx,
+            "rows": ny,
+            "mm_per_column": 2.0 * rx / (nx - 1),
+            "mm_per_row": 2.0 * ry / (ny - 1),
+            "x_of_column_0": -rx,
+            "y_of_row_0": ry,
+            "orientation": "seen from +z: columns run along +x, rows along -y; pixels are points, borders included",
+            "z_of_zero": counts.low,
+            "mm_per_count": counts.scale,
+            "quantum_mm": counts.quantum,
+            "z_least": counts.low,
+            "z_most": counts.high,
+            "z_of_flat_face": part.lens.z_in,
+            "turned": part.turned,
+            "to_the_scene": "(x, -y, -z)" if part.turned else "(x, y, z)",
+            "round": part.lens.opening.round,
+        }
+        | ({"spline": spline} if enough else {})
+        | ({} if part.register is None else {"register": part.register.figures})
+    )

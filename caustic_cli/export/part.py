@@ -30,12 +30,48 @@ from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 BLOCK = 0.2
 
 
+@dataclass(frozen=True)
+class Register:
+    """How both sides of a part lie in its stock, see `export.register`.
+
+    thickness: of the stock; wide, high: of the stock along X and Y; pins: X of their middles, at Y0; pin: their diameter; rim:
+    least thickness of the lens at its edge; all mm.
+    """
+
+    thickness: float
+    wide: float
+    high: float
+    pins: tuple[float, float]
+    pin: float
+    rim: float
+
+    @property
+    def figures(self) -> dict:
+        """For JSON."""
+        return {
+            "stock_mm": [self.wide, self.high, self.thickness],
+            "pins_mm": [[x, 0.0] for x in self.pins],
+            "pin_diameter_mm": self.pin,
+            "turned_over_about": "x",
+        }
+
+    def said(self, second: bool) -> list[str]:
+        """Comments of a program for a side."""
+        where = " and ".join(f"X{x:g} Y0" for x in self.pins)
+        side = (
+            "second, the first one on the table: fill it with wax or pitch; the stock is on the pins"
+            if second
+            else "first; then the stock is turned over about X onto pins in its holes"
+        )
+        return [f"(register: dowel pins of {self.pin:g} mm at {where} in both setups)", f"(side: {side})"]
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """Part in a file.
 
     scene: with z_in of the lens at the flat face; field, heights: the surface, (n, m) mm; kind: lens, mirror or mould; turned:
-    whether it is rotated, the (x, y, z) of the scene being (x, -y, -z) here.
+    whether it is rotated, the (x, y, z) of the scene being (x, -y, -z) here; register: to the other side, of a lens with two.
     """
 
     scene: Scene
@@ -43,6 +79,12 @@ class Part:
     heights: Tensor
     kind: str
     turned: bool = False
+    register: Register | None = None
+
+    @property
+    def face(self) -> str:
+        """What lies on the table."""
+        return "the flat face" if self.register is None else "the face of the stock"
 
     @property
     def lens(self) -> Lens:
@@ -71,12 +113,12 @@ def part_of(
         return Part(scene, field, heights, kind)
     room = BLOCK * max(lens.size) if block is None else block
     if (-lens.cut_from if mould else lens.cut_from) > 0:  # the mould of a mirror, with material below its surface as a lens
-        return Part(_alone(scene, float(heights.min()) - room), field, heights, kind)
+        return Part(alone(scene, float(heights.min()) - room), field, heights, kind)
     if format not in AS_CUT and not mould:
         back = float(heights.max()) + room if format in SOLIDS else lens.z_in
         return Part(replace(scene, lens=replace(lens, z_in=back)) if format in SOLIDS else scene, field, heights, kind)
     field, heights = turned(field, heights)
-    return Part(_alone(scene, float(heights.min()) - room), field, heights, kind, True)
+    return Part(alone(scene, float(heights.min()) - room), field, heights, kind, True)
 
 
 def turned(field: HeightField, heights: Tensor) -> tuple[HeightField, Tensor]:
@@ -85,9 +127,9 @@ def turned(field: HeightField, heights: Tensor) -> tuple[HeightField, Tensor]:
     return HeightField((u, SplineSpace(v.degree, 1.0 - v.knots.flip(0))), field.half_size), -heights.flip(1)
 
 
-def _alone(scene: Scene, base: float) -> Scene:
+def alone(scene: Scene, base: float) -> Scene:
     """A scene for a solid down to `base`, mm, without a border; its source and screen are placeholders."""
-    lens = replace(scene.lens, z_in=base, mirror=False, border=0.0, min_thickness=0.0)
+    lens = replace(scene.lens, z_in=base, mirror=False, border=0.0, min_thickness=0.0, entrance=None)
     return Scene(PlaneWave(), lens, Screen(scene.screen.size, base + 1e6, (2, 2)))
 
 

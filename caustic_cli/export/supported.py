@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from caustic_cli.export import FORMATS, SOLIDS
+from caustic_cli.export import AS_CUT, FORMATS, SOLIDS
 from caustic_cli.scene import Scene
 from caustic_cli.scene.traits import BEYOND_CLEAR, Capability
 
-#: Formats that hold a single refractive index, and formats that hold two free-form sides.
-ONE_INDEX, TWO_SIDED = ("lighttools", "zemax", "mitsuba"), ("lighttools", *SOLIDS, "mitsuba")
+#: Formats that hold a single refractive index, formats that hold all elements of a scene, and those that hold two free-form sides.
+ONE_INDEX, WHOLE = ("lighttools", "zemax", "mitsuba"), ("lighttools", *SOLIDS, "mitsuba")
+TWO_SIDED = (*WHOLE, *AS_CUT)
 
 ONE_SIDE = (
     f"⟨format⟩ {{format}} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both, without ⟨script⟩"
     " or ⟨mould⟩"
 )
-ONE_LENS = f"⟨format⟩ {{format}} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
+ONE_LENS = f"⟨format⟩ {{format}} holds a single lens; with other elements {', '.join(WHOLE)} hold the scene, without ⟨script⟩"
 SHAPE = (
     "⟨format⟩ {format} holds one index, and this lens' varies;"
     f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold its shape alone"

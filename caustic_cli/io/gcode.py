@@ -1,8 +1,9 @@
 """Reader of three-axis G-code programs (RS-274): linear moves, by tool.
 
-Supported are G0 and G1 with X, Y, Z in absolute millimetres (G21) or inches (G20), one motion per block, without block delete;
-G17, G90, G94, F, S, M and N words are ignored; comments are in parentheses or after a semicolon.  Arcs, relative moves, cycles,
-offsets and parameters are refused, since the simulated cut would be wrong.
+Supported are G0 and G1 with X, Y, Z in absolute millimetres (G21) or inches (G20), or with X, C, Z after a comment that names a
+tool of a lathe, one motion per block, without block delete; G17, G18, G90, G93, G94, F, S, M and N words are ignored; comments are
+in parentheses or after a semicolon.  Arcs, relative moves, cycles, offsets and parameters are refused, since the simulated cut
+would be wrong.
 
 Comments of exported programs give the tool, the stock, and the orientation of the part: see `export.milling.gcode`.
 """
@@ -22,14 +23,16 @@ from caustic_cli.io.files import naming, open_regular
 ACCEPTED = "a program of G0 and G1 moves is needed"
 #: Largest program read, bytes: some 20 million moves.
 MOST_BYTES = 1 << 29
+#: Kind of the tool of a lathe.
+LATHE = "round nose"
 #: Words of units, and mm of each.
 UNITS = {"G20": 25.4, "G21": 1.0}
 #: G words without influence on the tool path, or with the assumed modes; and ignored letters.
-IGNORED = {"G17", "G40", "G49", "G54", "G61", "G64", "G80", "G90", "G94", *"FSTMNH"}
+IGNORED = {"G17", "G18", "G40", "G49", "G54", "G61", "G64", "G80", "G90", "G93", "G94", *"FSTMNH"}
 
 _WORD = re.compile(r"([A-Z])\s*([+-]?(?:\d+\.?\d*|\.\d+))")
 _COMMENT = re.compile(r"\([^()]*\)|;.*")
-_TOOL = re.compile(r"\(tool: (ball nose|flat end), radius ([0-9.eE+-]+) mm\)")
+_TOOL = re.compile(r"\(tool: (ball nose|flat end|drill|round nose), radius ([0-9.eE+-]+) mm")
 _STOCK = re.compile(r"\(stock: .*top at Z([0-9.eE+-]+)\)")
 _ZERO = re.compile(r"\(Z0: ([0-9.eE+-]+) mm")
 _TURNED = re.compile(r"\(turned: (yes|no)")
@@ -37,8 +40,8 @@ _TURNED = re.compile(r"\(turned: (yes|no)")
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """Path of one tool: kind (ball nose, flat end, "" if unknown), radius, mm or None; successive positions of the tip (k, 3) mm;
-    rapid (k,), whether each was reached by G0."""
+    """Path of one tool: kind (ball nose, flat end, drill, round nose, "" if unknown), radius, mm or None; positions of the tip
+    (k, 3) mm, of a tool of a lathe X, mm, C, radians, and Z, mm; rapid (k,), whether each was reached by G0."""
 
     kind: str
     radius: float | None
@@ -69,6 +72,8 @@ class _Interpreter:
         #: G0 or G1, None before the first; the position, nan where unknown.
         self.motion: str | None = None
         self.position = [math.nan] * 3
+        #: Letters of its coordinates.
+        self.letters = "XYZ"
         #: mm of a coordinate's unit.
         self.unit = 1.0
 
@@ -83,8 +88,9 @@ class _Interpreter:
             raise InputError(f"line {number}: {line!r} is no block of words; {ACCEPTED}")
         moved = False
         for letter, value in _WORD.findall(line):
-            if letter in "XYZ":
-                self.position["XYZ".index(letter)] = float(value) * self.unit
+            if letter in self.letters:
+                unit = math.radians(1.0) if letter == "C" else self.unit
+                self.position[self.letters.index(letter)] = float(value) * unit
                 moved = True
             else:
                 self._mode(letter, value, number)
@@ -100,6 +106,7 @@ class _Interpreter:
         if tool := _TOOL.search(line):
             self.tools.append((tool[1], _real(tool[2], number)))
             self.moves.append([])
+            self.letters = "XCZ" if tool[1] == LATHE else "XYZ"
             self.position = [math.nan] * 3  # unknown after a tool change
 
     def _mode(self, letter: str, value: str, number: int) -> None:

@@ -76,6 +76,11 @@ class Envelope:
         )
         return z, cx, cy
 
+    def surface(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Heights, mm, and slopes along x and y at points (N,) mm."""
+        z, cx, cy = self(x, y)
+        return z, *self.slopes(x, y, cx, cy)
+
     def slopes(self, x: np.ndarray, y: np.ndarray, cx: np.ndarray, cy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Slopes Z_x and Z_y at points, from the ball centres there."""
         dx, dy = x - cx, y - cy

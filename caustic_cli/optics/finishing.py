@@ -30,6 +30,7 @@ from scipy import fft, interpolate
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.base import Surface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
@@ -48,6 +49,8 @@ ROUGH, CORRELATED = 1 / 70.0, 0.5
 SMOOTH = 1e-5
 #: Points of the grid along an axis: least, most, and for what a tool left; to a knot span of the surface, to a printer's pixel.
 LEAST_POINTS, MOST_POINTS, TOOLED, A_SPAN, A_PIXEL = 513, 2049, 1025, 2, 4
+#: Half width of the riser of a step, pixels.
+RISER = 1e-3
 #: What a correction leaves: T^2 / (T^2 + LEFT^2) of each frequency; relief grows 1 / (2 LEFT) times at most.
 LEFT = 0.03
 #: Degree of the polynomials in x and y that finishing does not change, and which are not corrected.
@@ -86,6 +89,10 @@ class Finish:
     def shaped(self, z: np.ndarray, spacing: tuple[float, float]) -> np.ndarray:
         """Heights (n, m), mm, on a grid of this spacing, mm, beside the filter."""
         return z
+
+    def exactly(self, relief: Relief) -> tuple[HeightField, Tensor] | None:
+        """The surface that it makes of one, and its control heights, where no grid holds it."""
+        return None
 
     def left(self, before: ResidualRoughness) -> ResidualRoughness:
         """The roughness after it."""
@@ -144,6 +151,19 @@ class Printed(Finish):
             at = (np.floor(x / self.pixel) + 0.5) * self.pixel
             middles.append(np.clip(np.rint(at / step + 0.5 * (n - 1)), 0, n - 1).astype(int))
         return self.layer * np.rint(z[np.ix_(*middles)] / self.layer)
+
+    def exactly(self, relief: Relief) -> tuple[HeightField, Tensor]:
+        """Terraces that are flat up to RISER pixels from their edges: a spline between points would make lenses of the edges."""
+        middles, spaces = [], []
+        for r in relief.half_size:
+            inner = np.arange(math.floor(-r / self.pixel) + 1, math.ceil(r / self.pixel)) * self.pixel
+            edges = np.concatenate([[-r], inner, [r]])
+            middles.append(np.clip((np.floor(0.5 * (edges[1:] + edges[:-1]) / self.pixel) + 0.5) * self.pixel, -r, r))
+            sides = (inner[:, None] + RISER * self.pixel * np.array([-1.0, 1.0])).ravel()
+            knots = np.concatenate([[0.0, 0.0], 0.5 * (sides / r + 1.0), [1.0, 1.0]])
+            spaces.append(SplineSpace(1, torch.from_numpy(knots)))
+        z = self.layer * np.rint(relief.at(*middles) / self.layer)
+        return HeightField((spaces[0], spaces[1]), relief.half_size), torch.from_numpy(z.repeat(2, 0).repeat(2, 1))
 
 
 def parse(text: str) -> tuple[Finish, ...]:
@@ -257,11 +277,14 @@ class Relief:
         x, y = (c.reshape(-1) for c in torch.meshgrid(*lines, indexing="ij"))
         return cls(surface.at(None, x, y)[0].view(shape).numpy(), half_size)
 
+    def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """The spline through it on grid lines x (a,), y (b,), mm: (a, b)."""
+        return interpolate.RectBivariateSpline(*self.lines, self.z, s=0)(x, y)
+
     def on(self, field: HeightField) -> tuple[HeightField, Tensor]:
         """The spline that interpolates it at the Greville abscissae of a surface, and its control heights (n, m), mm."""
         x, y = (c.numpy() for c in field.control_xy())
-        z = interpolate.RectBivariateSpline(*self.lines, self.z, s=0)(x, y)
-        return field, field.interpolated(torch.from_numpy(z))
+        return field, field.interpolated(torch.from_numpy(self.at(x, y)))
 
 
 def points(steps: tuple[Finish, ...], field: HeightField) -> tuple[int, int]:
@@ -286,7 +309,9 @@ def finished(steps: tuple[Finish, ...], relief: Relief, like: HeightField) -> tu
     """The surface after all steps: on a net with all details where a printer or a tool left some, else on that of the lens, `like`;
     relief: before the steps, at so many `points`."""
     for step in steps:
-        relief = Relief(step.shaped(relief.z, relief.spacing), relief.half_size).filtered(step.transfer)
+        before, relief = relief, Relief(step.shaped(relief.z, relief.spacing), relief.half_size).filtered(step.transfer)
+    if (exact := steps[-1].exactly(before)) is not None:
+        return exact
     detailed = any(step.program or isinstance(step, Printed) for step in steps)
     return HeightField.through(relief.z, relief.half_size) if detailed else relief.on(like)
 

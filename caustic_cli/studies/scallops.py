@@ -57,6 +57,11 @@ def scallops(scene: Scene, step: float, radius: float) -> dict:
 
 def rows(f: dict) -> list[tuple[str, str]]:
     """The figures of a machining program as rows of a table (name, text)."""
+    lathe = []
+    if "turns" in f:
+        blank = f"{f['turns']} turns of a blank of {f['blank_mm']:.4g} mm; clearance above {f['clearance_needed_deg']:.2g} degrees"
+        moves = f"Z up to {f['z_speed_mm_s']:.2g} mm/s and {f['z_acceleration_m_s2']:.2g} m/s²"
+        lathe.append(("on the lathe", f"{blank}; {moves}"))
     return [
         ("program", f"{f['lines']:,} lines, {f['length_mm']:,.0f} mm of cut, about {_time(f['minutes'])}"),
         (
@@ -64,6 +69,7 @@ def rows(f: dict) -> list[tuple[str, str]]:
             f"{f['step_over_mm']:.4g} mm apart, scallops up to {1e3 * f['scallop_mm']:.3g} µm,"
             f" slopes up to {f['scallop_slope']:.3g}",
         ),
+        *lathe,
         ("unpolished, by rays", f"blurs over {f['blur_mm']:.3g} mm, {f['blur_pixels']:.3g} pixels, across the passes"),
         ("as a wave", f"scatters {f['scattered']:.2%} of the light ({f['wavelength_nm']:.0f} nm)"),
         (

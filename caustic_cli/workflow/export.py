@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -18,12 +18,14 @@ from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.part import Part, part_of, turned
 from caustic_cli.export.reading import Reading, Readings
+from caustic_cli.export.register import other, sides_of, with_stock
 from caustic_cli.export.supported import EXPORT, refuse
 from caustic_cli.io.heightmaps import beside
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.facets import FacetSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import freeform_of
 from caustic_cli.project.project import Project
 from caustic_cli.project.uptodate import Outputs
 from caustic_cli.scene import Scene
@@ -81,6 +83,8 @@ class Exporter:
         """
         scene = at_own_wavelength(self.scene)
         refuse(scene, format, script, mould)
+        if format in AS_CUT and scene.lens.entrance is not None:
+            return self._write_sides(path, format, scene, Milling(**(milling or {})), given)
         part = part_of(format, scene, self.field, self.heights, mould, block)
         home = _home(format)
         writer = getattr(home, f"write_{format}")
@@ -90,14 +94,27 @@ class Exporter:
         scripts = import_module("caustic_cli.export.lighttools_script") if script else None
         arguments = _arguments(format, part)
         file, judged = File(home, arguments, path if format == "heightmap" else None, part), hasattr(home, "readings")
+        more = {key: given.pop(key) for key in getattr(home, "MORE", ()) if key in given}
         choice = given if not judged or {"samples", "tolerance"} & set(given) else self.smallest(file)
-        written = writer(path, *arguments, **choice)
+        written = writer(path, *arguments, **choice, **more)
         if scripts is not None:
             scripts.write_script(path, scene, self.field, self.heights, choice.get("samples"))
         found = self.figures(file, choice, format) if judged else {}
         if written is not None:
-            found["heightmap"] = {key: value for key, value in written.items() if key != "spline"}
+            found[format] = {key: value for key, value in written.items() if key != "spline"}
         return found
+
+    def _write_sides(self, path: Path, format: str, scene: Scene, m: Milling, given: dict) -> dict:
+        """Both sides of a lens with two free-form ones, in two files, for a machine."""
+        sides, paths, home = sides_of(scene, self.field, self.heights, m), (path, other(path)), _home(format)
+        if format == "gcode":
+            found, back = (home.write_gcode(p, s, with_stock(m, s), **given) for p, s in zip(paths, sides, strict=True))
+            return {"milling": found | _scallops(scene, self.field, found), "entrance": back, "register": sides[0].register.figures}
+        file = BothSides(home, (sides[0],), path, sides[0], other=File(home, (sides[1],), paths[1], sides[1]), scene=scene)
+        choice = given or self.smallest(file)
+        for p, s in zip(paths, sides, strict=True):
+            said = home.write_heightmap(p, s, **choice)
+        return self.figures(file, choice, format) | {"register": said["register"]}
 
     def error(self, file: File, choice: dict, key: str | None = None) -> float:
         """Relative RMS error of the picture through a file; key: which of its readings, that by which it is chosen unless given."""
@@ -215,6 +232,25 @@ class File:
         return turned(reading.surface, reading.heights)
 
 
+@dataclass(frozen=True, eq=False)
+class BothSides(File):
+    """The exit of a lens with two free-form sides; other: its entrance; read together."""
+
+    other: File = field(kw_only=True)
+    scene: Scene = field(kw_only=True)
+
+    def readings(self, choice: dict) -> Readings:
+        """As of a file, the exit with the entrance as read from its own."""
+
+        def both() -> Reading:
+            entrance, heights = self.other.in_the_scene(self.other.readings(choice)["error"]())
+            assert isinstance(entrance, HeightField) and heights is not None
+            exit_side = super(BothSides, self).readings(choice)["error"]()
+            return replace(exit_side, entrance=freeform_of(entrance, heights - self.scene.lens.z_in))
+
+        return {"error": both}
+
+
 def export(
     exporter: Exporter,
     opened: Project,
@@ -330,8 +366,11 @@ def _scallops(scene: Scene, field: HeightField, found: dict) -> dict:
 
 def files(path: Path, scene: Scene, format: str, script: bool = False) -> list[Path]:
     """All files of an export, the lens first."""
+    paths = [path, other(path)] if format in AS_CUT and scene.lens.entrance is not None else [path]
     if format == "heightmap":
-        return [path, beside(path)]
+        return [name for p in paths for name in (p, beside(p))]
+    if format == "gcode":
+        return paths
     if format == "phase":
         return [path, *_home(format).companions(path)]
     if format == "mitsuba":

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.gcode import read_program
+from caustic_cli.io.gcode import LATHE, read_program
 from caustic_cli.optics.envelope import Envelope
+from caustic_cli.optics.nose_envelope import NoseEnvelope
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Aperture, Scene
@@ -25,7 +26,7 @@ FAR = 0.05
 
 
 def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float | None = None) -> CutSurface:
-    """The surface that a program's ball-nose tools leave, in the scene's coordinates.
+    """The surface that a program's ball-nose or turning tools leave, in the scene's coordinates.
 
     Args:
         tool_radius: mm, for a program that does not give it.
@@ -33,13 +34,16 @@ def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float
     Raises:
         InputError: the program cannot be read, the radius of a tool is unknown, or no tool has a ball nose.
     """
-    program, envelopes = read_program(path), []
+    program, envelopes = read_program(path), list[Envelope | NoseEnvelope]()
     for cut in program.cuts:
         radius = cut.radius or tool_radius
-        if cut.kind == "flat end":  # roughing, above the finished surface
+        if cut.kind in ("flat end", "drill"):  # roughing, above the finished surface, and holes beside it
             continue
         if radius is None:
             raise InputError(f"{path}: does not give the radius of its ball-nose tool; ⟨tool_radius⟩ is needed")
+        if cut.kind == LATHE:
+            envelopes.append(NoseEnvelope(radius, cut.tips))
+            continue
         centres = cut.tips + np.array([0.0, 0.0, radius])
         top = math.inf if program.top is None else program.top
         envelopes.append(Envelope(radius, *_near(centres, top + radius), top=top))

@@ -25,10 +25,11 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.milling import Milling
+from caustic_cli.export.milling import TURNING, Milling
 from caustic_cli.export.milling.offset import BallOffset, FlatOffset, shape_of
-from caustic_cli.export.milling.paths import raster, spacing, spiral, with_heights
-from caustic_cli.export.part import Part
+from caustic_cli.export.milling.paths import batches, raster, spacing, spiral, with_heights
+from caustic_cli.export.milling.turning import write_turning
+from caustic_cli.export.part import Part, Register
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -40,13 +41,12 @@ from caustic_cli.schema.checks import LENGTH
 PATH_PART, MORE_DIGITS, LEAST_DIGITS = 0.01, 1, 4
 #: Largest overrun of the passes beyond the aperture, over the tool radius.
 MOST_OVER = 0.7
-#: Length of the initial moves of a path over the radius, at most a knot span; initial moves processed at a time, which bounds the
-#: memory.
-FIRST_MOVE, AT_A_TIME = 0.125, 4096
-#: Default least stock above the highest point, mm.
-FACING = 0.1
+#: Length of the initial moves of a path over the radius, at most a knot span.
+FIRST_MOVE = 0.125
 #: Roughing: step-over over the radius, tolerance over the allowance.
 ROUGH_STEP, ROUGH_PART = 0.5, 0.05
+#: Depth of the holes for pins, in their diameters, and what is left below them at least, in parts of the stock.
+HOLE, FLOOR = 3.0, 0.1
 #: mm of an inch.
 INCH = 25.4
 #: Rapid feed for the estimated time, mm/min: mills have 3 to 30 m/min.
@@ -133,6 +133,9 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     if tolerance is not None:
         checks.number("⟨tolerance⟩", tolerance, 0.0, LENGTH, open_low=True)
     m, base = milling or Milling(), part.lens.z_in
+    unit, simple = INCH if m.dialect.endswith("inch") else 1.0, m.dialect.startswith("simple")
+    if m.path == TURNING:
+        return write_turning(path, part, m, tolerance, unit, simple)
     field, heights = part.field, part.heights - base  # from here on Z0 is the flat face
     low, high, slope, concave = shape_of(field, heights)
     step = m.step(concave, slope)
@@ -141,22 +144,18 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     step = spacing(m.path, outline, step)
     scallop = m.scallop_of(step, concave, slope)
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
-    unit = INCH if m.dialect.endswith("inch") else 1.0
     digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance / unit)) + MORE_DIGITS)
-    top = _stock(m, high)
-    dips = low - m.tool_radius + math.sqrt(m.tool_radius**2 - min(2.0 * over * over, 0.99 * m.tool_radius**2))
-    if dips < 0.0:
-        raise InputError(
-            f"the tool would go {-dips:.3g} mm below the flat face at the edges: a thicker part (⟨lens.min_thickness⟩, ⟨block⟩), a"
-            " larger tool or finer scallops keep it above"
-        )
+    top = m.top(high)
+    _refuse_deep(part, low, m.tool_radius - math.sqrt(m.tool_radius**2 - min(2.0 * over * over, 0.99 * m.tool_radius**2)))
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
     passes = spiral(outline, step) if m.path == "spiral" else raster(outline, step, lines[m.path])
     with atomic_file(path) as file:
-        out = _Writer(file, digits, unit, m.dialect.startswith("simple"))
+        out = _Writer(file, digits, unit, simple)
         out.say(*_head(part, m, step, scallop, top, digits, tolerance))
         place = file.tell()
         out.say(" " * COUNTED, f"{'G21' if unit == 1.0 else 'G20'} G90 G17 G94")
+        if part.register is not None and not part.turned:
+            _drill(out, m, part.register, safe)
         if m.roughing is not None:
             _begin(out, m.roughing_tool, m.rough_radius, m.spindle, safe)
             _rough(out, m, field, heights, part.lens.opening, top, low, safe)
@@ -180,15 +179,34 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     }
 
 
+def _refuse_deep(part: Part, low: float, deeper: float) -> None:
+    """Refuse a part beside whose edges, at least `low` mm high, the tool goes deeper by so much, mm.
+
+    Raises:
+        InputError: it would cut into the table, or meet that of the other side.
+    """
+    if low < deeper:
+        raise InputError(
+            f"the tool would go {deeper - low:.3g} mm below the flat face at the edges: a thicker part (⟨lens.min_thickness⟩,"
+            " ⟨block⟩), a larger tool or finer scallops keep it above"
+        )
+    if part.register is not None and part.register.rim < 2.0 * deeper:
+        raise InputError(
+            f"the tools of both sides would meet beside the lens, whose edge is {part.register.rim:.3g} mm thick: a thicker lens"
+            " (⟨lens.thickness⟩), a larger tool or finer scallops keep it in its stock"
+        )
+
+
 def _head(part: Part, m: Milling, step: float, scallop: float, top: float, digits: int, tolerance: float) -> list[str]:
     """Header comments: part, tools and datum.  `io.gcode` reads those with a colon."""
-    wide, high = part.lens.size
+    wide, high = part.lens.size if part.register is None else (part.register.wide, part.register.high)
     turned = "yes, the scene's x, y, z is x, -y, -z here" if part.turned else "no"
     return [
         f"({CREATED})",
         f"(part: {part.kind})",
         f"(turned: {turned})",
-        f"(Z0: {part.lens.z_in:.17g} mm is its z in the other formats; the flat face, on the table)",
+        f"(Z0: {part.lens.z_in:.17g} mm is its z in the other formats; {part.face}, on the table)",
+        *([] if part.register is None else part.register.said(part.turned)),
         "(X0 Y0: the middle of the part; X Y Z are of the tool's tip)",
         f"(stock: {wide:g} x {high:g} x {top:g} mm, top at Z{top:g})",
         f"(finishing: {m.path}, step-over {step:.6g} mm, scallops up to {scallop:.3g} mm, moves within {tolerance:.3g} mm)",
@@ -196,8 +214,18 @@ def _head(part: Part, m: Milling, step: float, scallop: float, top: float, digit
     ]
 
 
+def _drill(out: _Writer, m: Milling, register: Register, safe: float) -> None:
+    """Write the holes for the dowel pins, from above, not through the stock."""
+    _begin(out, "drill", 0.5 * register.pin, m.spindle, safe)
+    for x in register.pins:
+        depth = min(HOLE * register.pin, (1.0 - FLOOR) * register.thickness)
+        _descend(out, np.array([x, 0.0, register.thickness - depth]), register.thickness, m.plunge)
+        out.rapid(z=safe)
+    out.say("M5", "M0 (change the tool)")
+
+
 def _begin(out: _Writer, tool: str, radius: float, spindle: float, safe: float) -> None:
-    name = "ball nose" if tool == "ball" else "flat end"
+    name = {"ball": "ball nose", "flat": "flat end"}.get(tool, tool)
     out.say(f"(tool: {name}, radius {radius:.17g} mm)", f"M3 S{spindle:g}")
     out.rapid(z=safe)
     out.feed = 0.0
@@ -211,27 +239,6 @@ def _descend(out: _Writer, to: np.ndarray, top: float, plunge: float) -> None:
     out.cut(to[None], plunge)
 
 
-def _batches(passes: Iterator[np.ndarray], move: float) -> Iterator[np.ndarray]:
-    """Concatenate consecutive passes into lines of about AT_A_TIME initial moves."""
-    held, moves = [], 0.0
-    for line in passes:
-        held.append(line if not held else line[1:])
-        moves += float(np.hypot(*np.diff(line, axis=0).T).sum()) / move
-        if moves > AT_A_TIME:
-            yield np.concatenate(held)
-            held, moves = [line[-1:]], 0.0
-    if sum(map(len, held)) > 1:
-        yield np.concatenate(held)
-
-
-def _stock(m: Milling, high: float) -> float:
-    """Height of the stock, mm, for a surface up to `high` mm."""
-    top = math.ceil((high + FACING) * 10.0) / 10.0 if m.stock is None else m.stock
-    if top < high:
-        raise InputError(f"⟨stock⟩ must reach the surface's highest point, {high:.6g} mm above Z0, got {top:g} mm")
-    return top
-
-
 def _finish(
     out: _Writer, m: Milling, field: HeightField, heights: Tensor, passes: Iterator[np.ndarray], top: float, tolerance: float
 ) -> None:
@@ -239,7 +246,7 @@ def _finish(
     offset, first = BallOffset(field, heights, m.tool_radius), True
     spans = (2.0 * r / (len(s.breaks) - 1) for s, r in zip(field.spaces, field.half_size, strict=True))
     move = min(FIRST_MOVE * m.tool_radius, *spans)
-    for line in _batches(passes, move):
+    for line in batches(passes, move):
         points = with_heights(line, offset, move, tolerance)
         if first:
             _descend(out, points[0], top, m.plunge)

@@ -16,8 +16,8 @@ from caustic_cli.scene import Aperture, CircularAperture
 
 #: Largest deviation of the polygon from a spiral, over the step-over.
 OFF = 0.02
-#: Most bisections of a move.
-HALVINGS = 14
+#: Most bisections of a move; initial moves processed at a time, which bounds the memory.
+HALVINGS, AT_A_TIME = 14, 4096
 
 
 def spacing(path: str, aperture: Aperture, step: float) -> float:
@@ -92,12 +92,16 @@ def _rectangular(half: list[float], step: float) -> np.ndarray:
 
 
 def with_heights(
-    line: np.ndarray, height: Callable[[np.ndarray, np.ndarray], np.ndarray], step: float, tolerance: float
+    line: np.ndarray,
+    height: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    step: float,
+    tolerance: float,
+    probes: tuple[float, ...] = (),
 ) -> np.ndarray:
     """Points (m, 3), mm, along a polyline (k, 2) with heights from a function.
 
-    Starts with moves of at most `step` and bisects each whose midpoint deviates from the height by more than `tolerance`.  Points
-    without a height (NaN) are omitted.
+    Starts with moves of at most `step` and bisects each whose midpoint, or points at the parts `probes` of its length, deviate from
+    the height by more than `tolerance`.  Points without a height (NaN) are omitted.
     """
     length = np.hypot(*np.diff(line, axis=0).T)
     parts = np.maximum(1, np.ceil(length / step)).astype(int)
@@ -113,6 +117,9 @@ def with_heights(
         found = height(*middle.T)
         with np.errstate(invalid="ignore"):
             off = np.abs(found - 0.5 * (z[begin] + z[end])) > tolerance
+            for t in probes:
+                there = height(*((1.0 - t) * xy[begin] + t * xy[end]).T)
+                off |= np.abs(there - (1.0 - t) * z[begin] - t * z[end]) > tolerance
         if not off.any():
             break
         new = len(xy) + np.arange(off.sum())
@@ -123,3 +130,16 @@ def with_heights(
     order = np.argsort(place, kind="stable")
     points = np.column_stack([xy, z])[order]
     return points[np.isfinite(points[:, 2])]
+
+
+def batches(passes: Iterator[np.ndarray], move: float) -> Iterator[np.ndarray]:
+    """Concatenate consecutive passes into lines of about AT_A_TIME initial moves."""
+    held, moves = [], 0.0
+    for line in passes:
+        held.append(line if not held else line[1:])
+        moves += float(np.hypot(*np.diff(line, axis=0).T).sum()) / move
+        if moves > AT_A_TIME:
+            yield np.concatenate(held)
+            held, moves = [line[-1:]], 0.0
+    if sum(map(len, held)) > 1:
+        yield np.concatenate(held)

@@ -1,4 +1,4 @@
-"""A machined surface: the lower envelope of a ball-nose tool along its path, including the cusps between passes.
+"""A machined surface: the lower envelope of a ball or of a turning tool along its path, including the cusps between passes.
 
 It has no free parameters.  For a part that was cut upside down, or a mould, it is turned over: the scene's z = -Z(x, -y).  Across a
 pass the curvature is that of the ball, 1 / R; at the cusps the slope is discontinuous.
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from caustic_cli.optics.envelope import Envelope
+from caustic_cli.optics.nose_envelope import NoseEnvelope
 from caustic_cli.optics.surfaces.base import MeasuredSurface
 
 #: Points along each axis at which bounds are sampled.
@@ -26,7 +27,7 @@ class CutSurface(MeasuredSurface):
     """The minimum of the envelopes of one or several tools over an aperture."""
 
     #: Of each tool, in the program's coordinates.
-    envelopes: tuple[Envelope, ...]
+    envelopes: tuple[Envelope | NoseEnvelope, ...]
     #: Half widths of the aperture, mm.
     half_size: tuple[float, float]
     #: z of the program's origin in the scene, mm.
@@ -49,8 +50,7 @@ class CutSurface(MeasuredSurface):
         across = -1.0 if self.turned else 1.0
         y, envelopes = across * y, []
         for one in self.envelopes:
-            z, cx, cy = one(x, y)
-            envelopes.append((z, *one.slopes(x, y, cx, cy)))
+            envelopes.append(one.surface(x, y))
         z, gx, gy = envelopes[0]
         for other in envelopes[1:]:
             lower = other[0] < z

@@ -51,10 +51,11 @@ class FinishedPart(Output):
             rendering.lens = self.part.finished()
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
-        """finishes, or finish: the steps, error, error_by and noise as designed, and for the weaker and the stronger end of what is
-        known of the steps; the deviation from the designed surface, and the roughness that is left."""
+        """finishes and needed, see `finishing.needed`, or finish: the steps, error, error_by and noise as designed, and for the
+        weaker and the stronger end of what is known of the steps; the deviation from the designed surface, and the roughness that
+        is left."""
         if self.ladder:
-            return {"finishes": self.ladder}
+            return {"finishes": self.ladder, "needed": finishing.needed(self.ladder)}
         if self.part is None:
             return {}
         designed, how = self.part.lens, {"rays": rendering.rays, "seed": rendering.seed}
@@ -64,18 +65,28 @@ class FinishedPart(Output):
             "scattered": self.part.scattered,
         }
         figures |= {f"nominal_{key}": value for key, value in finishing.judged(designed, **how).items()}
-        figures |= dict(zip(("weaker_error", "stronger_error"), self.part.unsure(**how), strict=True))
+        figures |= dict(zip(("weaker_error", "stronger_error"), self.part.unsure(**how), strict=False))
         return {"finish": figures | finishing.deviation(rendering.lens, designed)}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
         if found := figures.get("finishes"):
             say.table("finishes: error, and that of weaker and stronger steps", [(row["finish"], _words(row)) for row in found])
+            if kept := figures["needed"]:
+                rows = [
+                    (f"up to {row['error']:.4f} ({row['over']:g} times)", ", ".join(row["finishes"]) or "none of these")
+                    for row in kept
+                ]
+                say.table("finishes that keep an error, at the worse end of what is known of them", rows)
         if f := figures.get("finish"):
             rows = []
             if f["nominal_error"] is not None:
-                error = f"{finishing.said(figures['error'])} by {figures['error_by']}; as designed {f['nominal_error']:.4f}"
+                noise = figures["noise"] if figures["error_by"] == "rays" else None
+                error = f"{finishing.said(figures['error'], noise)} by {figures['error_by']}"
+                error += f"; as designed {finishing.said(f['nominal_error'], f['nominal_noise'])}"
+                rows.append(("relative RMS error", error))
+            if "weaker_error" in f and f["nominal_error"] is not None:
                 unsure = f"weaker ones {finishing.said(f['weaker_error'])}; stronger ones {finishing.said(f['stronger_error'])}"
-                rows += [("relative RMS error", error), ("steps known to a factor", unsure)]
+                rows.append(("steps known to a factor", unsure))
             rough = (
                 f"slopes RMS {f['roughness']:.2g}, scatters {f['scattered']:.0%} of the light"
                 if f["roughness"]
@@ -91,10 +102,12 @@ class FinishedPart(Output):
 
 def _words(row: dict[str, Any]) -> str:
     """A row of the ladder."""
+    if "why" in row:
+        return row["why"]
     slopes = f"slopes off by RMS {row['slope_rms']:.2g}"
     if row["error_by"] is None or row.get("low", 0.0) is None:
         return slopes
-    error = f"{finishing.said(row['error'])} by {row['error_by']}"
+    error = f"{finishing.said(row['error'], row.get('noise'))} by {row['error_by']}"
     if "low" not in row:
         return error
     rough = f", scatters {row['scattered']:.0%} of the light" if row["scattered"] > FEW else ""
