@@ -223,10 +223,18 @@ class Tracer:
         """The direct light at the last element."""
         return cast(Interaction, [self._front.behind, *self._interactions(parameters)][-1])  # a system has at least one element
 
+    def ends(self, parameters: Parameters) -> tuple[Interaction, Interaction]:
+        """The direct light at a lens' exit, at the last element if there is none, and at the last element."""
+        exit, last = None, self._front.behind
+        for last in self._interactions(parameters):
+            exit = last if last.element.name == EXIT else exit
+        assert last is not None  # a system has at least one element
+        return exit or last, last
+
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
         """Rays at a lens' exit in its frame: slopes of the surface, directions in front of it, powers in front of it."""
-        exit = next((m for m in self._interactions(parameters) if m.element.name == EXIT), None) or self.last(parameters)
+        exit, _ = self.ends(parameters)
         assert exit.power_in is not None
         return exit.hit.slopes, exit.hit.incoming, exit.power_in
 
