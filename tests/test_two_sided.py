@@ -23,12 +23,13 @@ from caustic_cli.inverse.two_sided_objective import TwoSidedObjective
 from caustic_cli.io.archive import open_archive
 from caustic_cli.kinds import problem_of
 from caustic_cli.kinds.robust import RobustTwoSides
+from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.misalignment import Misalignment, landing_points
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import ENTRANCE, EXIT, System, fixed_surface, split_heights
-from caustic_cli.optics.trace import expose, render
+from caustic_cli.optics.trace import Tracer, expose, render
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen, SecondTarget
 from caustic_cli.studies.retrace import retrace
@@ -298,6 +299,53 @@ def test_a_robust_loss_of_both_sides_has_their_gradients(_here, capfd):
     step = 1e-5 * way
     change = (loss(both + step).loss - loss(both - step).loss) / 2.0
     assert change == pytest.approx(float((found.gradient * step).sum()), rel=0.02)
+
+
+def test_rays_behind_a_fixed_entrance_are_traced_by_the_fused_kernel(_here, capfd):
+    """To the image, losses and derivatives of the stages; on the way back to one plane some lines of rays leave the aperture."""
+    run(capfd, "design", "one.png", *SMALL, "--collimate", "--mag", "0.8", "--iterations", "1", "-o", "p")
+    lens = load("p")
+    system, rays = System.of(lens.scene, lens.field), next(iter(rays_of(lens.scene, "grid", 40_000).chunks()))
+    found = []
+    for requests in (NO_REQUESTS, Requests.to(stages=True)):
+        traced, heights = Tracer(system, rays, torch.float64, requests), lens.heights.clone().requires_grad_()
+        assert (traced.fused is None) == requests.stages
+        seen = traced.expose({EXIT: heights}, lens.scene.screen, Filter("cosine", (3, 3)))
+        weight = torch.linspace(0.0, 1.0, PIXELS, dtype=torch.float64)
+        (seen.image * weight[:, None]).sum().backward()
+        found.append((seen.image.detach(), heights.grad, seen.lost["missed_surface"]))
+    state = Tracer(system, rays, torch.float64, Requests.to(stages=True)).start.expanded()
+    (x, y, z), (dx, dy, dz) = state.full(state.origin), state.full(state.direction)
+    outside = ((x - z / dz * dx).abs() > 5.0) | ((y - z / dz * dy).abs() > 5.0)
+    assert outside.sum() > 10
+    for one, other in zip(*found, strict=True):
+        assert torch.allclose(torch.as_tensor(one), torch.as_tensor(other), rtol=1e-9, atol=1e-12)
+
+
+def test_the_last_stage_moves_the_exit_alone_on_a_finer_net(_here, capfd):
+    small = [a for a in SMALL if a not in ("--control", "35")]
+    options = (*small, "--second", "two.png", "--second-at", "400", "--second-size", "26", "--resolution", "24")
+    run(capfd, "design", "one.png", *options, "--iterations", "30", "-o", "p")
+    stages = Project.open("p").settings.design.stages
+    assert [(s.control, s.exit_alone) for s in stages] == [((51, 51), False), ((147, 147), True)]
+    before = load("p")
+    made = run(capfd, "design", "--resume", "p", "--iterations", "34", "--quiet", "--json")
+    after = load("p")
+    line = np.linspace(-4.9, 4.9, 60)
+    entrances, exits = (
+        [one.surface(line[:, None], line[None, :], side)[0] for one in (before, after)] for side in ("entrance", "exit")
+    )
+    assert np.abs(entrances[0] - entrances[1]).max() < 1e-9 and np.abs(exits[0] - exits[1]).max() > 1e-7
+    assert (
+        made["relative_rms"] < before.figures["relative_rms"]
+        and made["second_relative_rms"] < 1.05 * before.figures["second_relative_rms"]
+    )
+
+
+def test_a_stage_of_the_exit_alone_needs_other_surfaces(_here, capfd):
+    Path("alone.toml").write_text("[[design.stages]]\nexit_alone = true\n")
+    said = run(capfd, "design", "one.png", *SMALL, "--config", "alone.toml", "-o", "p", code=2)
+    assert "exit_alone needs other free-form surfaces" in said and not Path("p").exists()
 
 
 def test_mitsuba_traces_both_sides(_here, capfd):
