@@ -43,7 +43,9 @@ from caustic_cli.project.project import Project
 from caustic_cli.scene import Aperture, Component, FoldMirror, Lens, Light, Offset, PlaneWave, Points, Pupil, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
+from caustic_cli.studies.effects import _row
 from caustic_cli.studies.retrace import retrace
+from caustic_cli.workflow.convergence import STUDIES
 
 PIXELS = 32
 LENS = Lens((10.0, 10.0), control=(35, 35), offset=Offset(5.0), fresnel="none")
@@ -506,6 +508,16 @@ def test_effects_know_of_all_glasses_and_apertures():
     assert float(image.image.sum()) + sum(lost.values()) == pytest.approx(1.0, abs=1e-12)
     narrow = replace(scene, elements=(replace(glass, size=(8.0, 8.0)), replace(scene.elements[1], size=(8.0, 8.0))))
     assert expose(narrow, FIELD, wavy(), rays_of(narrow, "stratified", 20_000)).lost["missed_surface"] > 0.1
+
+
+def test_a_study_of_effects_leaves_out_what_other_elements_exclude():
+    scene = replace(SCENE, elements=(thick(60.0, 26.0, (150.0, -150.0), 6.0, 1.5),))
+    plan = compile_plan(scene, FIELD, wavy())
+    asked = {one.name: one for one in plan.effects if one.name in ("gradient-index", "mirror", "absorption", "fresnel")}
+    rows = {name: _row(one, plan, scene, FIELD, wavy(), 500, 1, 0, torch.float64) for name, one in asked.items()}
+    assert rows.pop("gradient-index") is None and rows.pop("mirror") is None
+    assert len(rows) == 2 and all(row is not None for row in rows.values())
+    assert STUDIES["effects"].capability.supports(scene)
 
 
 @pytest.mark.parametrize("aperture", ["rectangle", "circle"])

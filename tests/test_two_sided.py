@@ -31,7 +31,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import ENTRANCE, EXIT, System, fixed_surface, split_heights
 from caustic_cli.optics.trace import Tracer, expose, render
 from caustic_cli.project.project import Project
-from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen, SecondTarget
+from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Points, Scene, Screen, SecondTarget
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures
 from caustic_cli.studies.tolerances import Trials
@@ -134,6 +134,25 @@ def test_the_loss_has_the_gradients_of_both_sides(second):
         step = 2e-6
         ahead, behind = (objective(nets + s * step * way).loss for s in (1, -1))
         assert (gradient * way).sum() == pytest.approx((ahead - behind) / (2 * step), rel=2e-3, abs=1e-9)
+
+
+@pytest.mark.parametrize("second", [SecondTarget(), SecondTarget(focus=(1.0, 2.0, 200.0))])
+def test_colours_of_one_index_have_the_loss_of_their_sum(second):
+    field, heights = HeightField.of(LENS), torch.stack([torch.zeros(51, 51), torch.full((51, 51), 15.0)]).double()
+    bumps = (
+        0.02 * torch.randn(heights.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).cumsum(1).cumsum(2) / 51
+    )
+    light, found = torch.from_numpy(ONE), []
+    for colours, target in (((), light), ((611.0, 549.0, 464.0), torch.stack([light] * 3))):
+        scene = Scene(PlaneWave(), LENS, NEAR, Light(wavelengths=colours, color=bool(colours)), second_target=second)
+        rays = rays_of(scene, "grid", 10_000)
+        loss = TwoSidedObjective(
+            scene, field, rays, (target,), "rms", LossImage(filter=Filter("cosine", (3, 3))), dtype=torch.float64
+        )
+        one = loss(heights + bumps)
+        found.append((one.loss, one.gradient))
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-9)
+    assert torch.allclose(found[0][1], found[1][1], rtol=1e-6, atol=1e-9 * float(found[0][1].abs().max()))
 
 
 def test_a_designed_entrance_traces_as_the_free_one():
@@ -388,6 +407,7 @@ def test_a_disc_s_light_is_collimated(_here, capfd, monkeypatch):
         (("--second-at", "400"), "--second-at belongs to --second"),
         (("--collimate", "--focus", "0,0,300"), "--collimate and --focus both define"),
         (("--collimate", "--mirror"), "--mirror cannot be combined with --collimate"),
+        (("--second", "two.png", "--second-at", "400", "--color"), "the second picture has no colours"),
         (("--focus", "0,0,20"), "must lie behind the picture's screen at 50 mm"),
         (("--collimate", "--waves", "on"), "--waves on"),
         (("--collimate", "--source", "point", "--start", "offset"), "must be transport"),

@@ -61,7 +61,7 @@ class TwoSidedObjective(Objective):
         images = [traced.collect(states, channel.screen, channel.how.filter) for channel in self.channels]
         found = [channel.pooled(image.image) for channel, image in zip(self.channels, images, strict=True)] + [images[0].leaving]
         if len(images) == 1:
-            found.append(traced.weight * squared_angular_error(traced, states[0], self.scene))
+            found.append(traced.of_color(traced.weight * squared_angular_error(traced, states[0], self.scene)))
         return found
 
     def _penalty(self, parameters: Parameters) -> Tensor:
@@ -76,7 +76,7 @@ class TwoSidedObjective(Objective):
             (channel.loss(image, leaving, entering=entering) * channel.loss.target.numel()).square()
             for channel, image in zip(self.channels, seen, strict=True)
         ]
-        first, other = *terms, *(angle / (leaving * SHARP**2) for angle in angles)
+        first, other = *terms, *(angle.sum() / (leaving.sum() * SHARP**2) for angle in angles)
         square, pixels = 0.5 * (first + other) + penalty, self.loss.target.numel()
         if not float(square.detach()) > 0:
             return square / pixels  # zero loss: the square root has no derivative there, its square has

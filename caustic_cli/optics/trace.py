@@ -119,7 +119,7 @@ class Tracer:
         #: Power through the pupil, (), where a fused pencil knows it without a trace of the rays in front of the lens.
         self.lit: Tensor | None = getattr(self.fused, "entering", None)
         #: Power through the pupil, () or, with colours, (3,).
-        self.entering = self._of_color(weight * (self._front.entering if self.lit is None else self.lit))
+        self.entering = self.of_color(weight * (self._front.entering if self.lit is None else self.lit))
 
     @cached_property
     def _front(self) -> Front:
@@ -282,9 +282,9 @@ class Tracer:
         w = self.weight
         if w != 1.0:
             image, leaving, lost = w * image, w * leaving, {name: w * value for name, value in lost.items()}
-        return Image(self._of_color(image), self._of_color(leaving), lost, self.count)
+        return Image(self.of_color(image), self.of_color(leaving), lost, self.count)
 
-    def _of_color(self, value: Tensor) -> Tensor:
+    def of_color(self, value: Tensor) -> Tensor:
         """`value` in this light's colour channel of three; unchanged without colours."""
         if self.channel is None:
             return value
