@@ -165,7 +165,7 @@ STANDARD = Effort(
         large=LargePictures(700, rays_per_pixel=8, most_rays=16_000_000, plan=((1.0, 24),)),
     ),
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
-    system=Refinement(2.0, 384, 48, 3_000_000, 4, ((1.0, 30),)),
+    system=Refinement(2.0, 384, 48, 3_000_000, 4, ((1.0, 50),)),
     exit_alone=Refinement(6.0, 1152, 64, 4_000_000, 8, ((1.0, 16),), 96),
     waves=((5, 20), (6, 20)),
     wave_seconds=25.0,

@@ -344,11 +344,11 @@ def test_rays_behind_a_fixed_entrance_are_traced_by_the_fused_kernel(_here, capf
 def test_the_last_stage_moves_the_exit_alone_on_a_finer_net(_here, capfd):
     small = [a for a in SMALL if a not in ("--control", "35")]
     options = (*small, "--second", "two.png", "--second-at", "400", "--second-size", "26", "--resolution", "24")
-    run(capfd, "design", "one.png", *options, "--iterations", "30", "-o", "p")
+    run(capfd, "design", "one.png", *options, "--iterations", "50", "-o", "p")
     stages = Project.open("p").settings.design.stages
     assert [(s.control, s.exit_alone) for s in stages] == [((51, 51), False), ((147, 147), True)]
     before = load("p")
-    made = run(capfd, "design", "--resume", "p", "--iterations", "34", "--quiet", "--json")
+    made = run(capfd, "design", "--resume", "p", "--iterations", "54", "--quiet", "--json")
     after = load("p")
     line = np.linspace(-4.9, 4.9, 60)
     entrances, exits = (
