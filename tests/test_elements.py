@@ -27,18 +27,25 @@ from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.wave_objective import WaveObjective
 from caustic_cli.io.archive import open_archive
+from caustic_cli.kinds import problem_of
+from caustic_cli.kinds.robust import RobustElements
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.frames import AxisSegment
+from caustic_cli.optics.frames import AxisSegment, Pose, rotate_to_global
 from caustic_cli.optics.misalignment import Misalignment, landing_points
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField, Sphere
-from caustic_cli.optics.system import EXIT, System, split_heights
+from caustic_cli.optics.system import ENTRANCE, EXIT, PlacedScreen, System, split_heights
 from caustic_cli.optics.trace import Tracer, expose, render
 from caustic_cli.optics.waves.image import wave_image
-from caustic_cli.scene import Component, FoldMirror, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.project.project import Project
+from caustic_cli.scene import Aperture, Component, FoldMirror, Lens, Light, Offset, PlaneWave, Points, Pupil, Scene, Screen
+from caustic_cli.scene.sources.rays import Measured
+from caustic_cli.scene.sources.rayset import RaySet
+from caustic_cli.studies.effects import _row
 from caustic_cli.studies.retrace import retrace
+from caustic_cli.workflow.convergence import STUDIES
 
 PIXELS = 32
 LENS = Lens((10.0, 10.0), control=(35, 35), offset=Offset(5.0), fresnel="none")
@@ -215,6 +222,52 @@ def test_a_mirror_that_the_beam_exceeds_cuts_the_wave_image_as_it_cuts_the_rays(
     assert float((waves.image - rays.image).norm() / rays.image.norm()) < 0.05
 
 
+def test_a_lens_behind_focuses_a_square_beam_to_the_pattern_of_its_aperture():
+    """Fraunhofer's: sin^2 of an aperture a along each axis, as wide as the wavelength times the focal length over a."""
+    a, radius, length = 2.0, (60.0, -90.0), INFRARED.wavelengths[0] * 1e-6
+    small = Lens((a, a), control=(8, 8), offset=Offset(5.0), fresnel="none")
+    behind = thick(60.0, 6.0, radius)
+    m = matrix(radius, behind.thickness, behind.index)
+    focal, back = -1.0 / m[1, 0], -m[0, 0] / m[1, 0]
+    half = 2.5 * length * focal / a
+    screen = Screen((2.0 * half, 2.0 * half), 60.0 + behind.thickness + back, (25, 25))
+    scene = Scene(PlaneWave(), small, screen, light=INFRARED, elements=(behind,))
+    field = HeightField.of(small)
+    found = wave_image(scene, field, torch.full(field.shape, 5.0, dtype=torch.float64), dtype=torch.float64)
+    fine = (np.arange(25 * 40) + 0.5) / (25 * 40) * 2.0 - 1.0
+    line = np.sinc(2.5 * fine).reshape(25, 40) ** 2
+    line = line.sum(1) * (5.0 / (25 * 40))  # its integral over all x is 1
+    expected = np.outer(line, line)
+    assert np.abs(found.image.numpy() - expected).max() < 0.01 * expected.max()
+
+
+LENSES = (thick(60.0, 40.0, (120.0, -120.0), 9.0),), (thick(60.0, 40.0, (70.0, -80.0), 14.0),)
+
+
+@pytest.mark.parametrize("elements", [(thick(-30.0, 12.0, (150.0, math.inf)),), *LENSES, (mirror(100.0, (45.0, 0.0), -900.0),)])
+def test_the_wave_image_through_other_elements_is_near_that_of_the_rays(elements):
+    """As near as for the lens by itself, whose picture it turns over behind the second of the lenses."""
+    apart = []
+    for beside in ((), elements):
+        scene = replace(SCENE, light=INFRARED, elements=beside)
+        waves, rays = wave_image(scene, FIELD, wavy()), expose(scene, FIELD, wavy(), rays_of(scene, "stratified", 200_000, 1))
+        assert waves.leaving == pytest.approx(float(rays.image.sum()), rel=0.01)
+        apart.append(float((waves.image - rays.image).norm() / rays.image.norm()))
+    assert apart[1] < 2.0 * apart[0] < 0.06
+
+
+def test_paths_through_a_lens_behind_change_with_the_exit_as_a_new_trace_says():
+    scene, target = replace(SCENE, light=INFRARED, elements=LENSES[0]), torch.from_numpy(picture())
+    way = (wavy() - wavy().mean()) / wavy().std()
+    there = wavy() + 3e-4 * way  # steeper by 1 %
+    first, other = (WaveObjective(scene, FIELD, h, target, "rms") for h in (wavy(), there))
+    before, linear, exact = first(wavy()).loss, first(there).loss, other(there).loss
+    assert abs(exact - before) > 1e-3 * before and linear - before == pytest.approx(exact - before, rel=0.1)
+    gradient = first(wavy()).gradient
+    ends = [first(wavy() + sign * 1e-7 * way).loss for sign in (1, -1)]
+    assert (ends[0] - ends[1]) / 2e-7 == pytest.approx(float((gradient * way).sum()), rel=0.02)
+
+
 def test_errors_displace_the_image_behind_a_flat_mirror_as_that_of_the_straight_scene():
     errors = Misalignment(throw=2.0, lens_shift=(0.1, 0.2), lens_tilt=(0.3, 0.1), screen_shift=(0.4, 0.5), screen_tilt=(1.0, 2.0))
     rays = rays_of(SCENE, "stratified", 4_000, 1)
@@ -225,6 +278,91 @@ def test_errors_displace_the_image_behind_a_flat_mirror_as_that_of_the_straight_
     assert torch.allclose(found.x, straight.x, atol=1e-9) and torch.allclose(found.y, -straight.y, atol=1e-9)
     near = errors.upright(folded).screen
     assert near.shift[1] == pytest.approx(-mirrored.upright(SCENE).screen.shift[1], abs=1e-9) and near.mirrored == (False, True)
+
+
+ERRORS = Misalignment(
+    index=0.01,
+    thickness=0.1,
+    throw=1.5,
+    lens_shift=(0.3, -0.2),
+    lens_tilt=(1.0, -2.0),
+    source_shift=(0.1, 0.2),
+    source_distance=-1.0,
+    source_tilt=(0.3, -0.4),
+    screen_shift=(0.2, 0.1),
+    screen_tilt=(1.0, 0.5),
+)
+BESIDE = (thick(-20.0, 14.0, (80.0, math.inf)), thick(30.0, 20.0, thickness=5.0), mirror(70.0, (40.0, 0.0), -400.0, 60.0))
+
+
+def in_the_room(scene: Scene, e: Misalignment) -> tuple[System, PlacedScreen]:
+    """System and screen with these errors in the frame of the elements that keep their places."""
+    plain, stand = (
+        System.of(replace(scene, lens=replace(LENS, index=LENS.index + e.index)), FIELD),
+        Pose((*e.lens_shift, 0.0), e.lens_tilt),
+    )
+    foot = rotate_to_global(stand, (0.0, 0.0, e.thickness - LENS.z_in))
+    entrance = replace(stand, position=(*e.lens_shift, LENS.z_in))
+    poses = {ENTRANCE: entrance, EXIT: replace(stand, position=tuple(a + b for a, b in zip(entrance.position, foot, strict=True)))}
+    elements = tuple(replace(one, pose=poses.get(one.name, one.pose)) for one in plain.elements)
+    leg = plain.leg or AxisSegment()
+    screen = Pose(leg.at(*e.screen_shift, scene.screen.z + e.throw), e.screen_tilt, leg.frame)
+    return replace(plain, elements=elements, lit=Pupil(Aperture((60.0, 60.0)), -30.0)), PlacedScreen(scene.screen, screen)
+
+
+@pytest.mark.parametrize("elements", [BESIDE[:1], BESIDE[1:2], BESIDE[1:], BESIDE])
+@pytest.mark.parametrize("source", [PlaneWave(), Points(((0.5, -0.3, -80.0),))])
+def test_a_lens_that_stands_otherwise_among_elements_is_so_in_the_room(source, elements):
+    """The same rays, traced through turned and shifted surfaces in the frame of the other elements."""
+    scene, e = replace(SCENE, source=source, screen=replace(SCREEN, z=120.0), elements=elements), ERRORS
+    heights = LENS.offset.thickness + 0.01 * wavy() / wavy().abs().max()
+    rays = rays_of(e.scene(scene), "stratified", 2000, 1)
+    (seen,) = landing_points(scene, FIELD, heights, rays, e)
+    system, frame = System.of(e.scene(scene), FIELD), e.frame(scene)
+    (state,) = rays.chunks(10**6)
+    if not isinstance(state, RayState):
+        state = RayState.on_axis(state, system.pupil.half_size, system.pupil.z)
+    state = e.directed(scene, e.scene(scene).source, state).expanded()
+    origin, direction = state.full((*state.origin[:2], state.origin[2] + state.datum)), state.full(state.direction)
+    origin = rotate_to_global(frame, (origin[0], origin[1], origin[2] - LENS.z_in))
+    origin = [a + b for a, b in zip(origin, frame.position, strict=True)]
+    direction = rotate_to_global(frame, direction)
+    start = tuple(o - (40.0 + origin[2]) / direction[2] * d for o, d in zip(origin, direction, strict=True))
+    room, screen = in_the_room(scene, e)
+    landed = Tracer(room, RayState(start, direction, torch.ones_like(start[0]))).land({EXIT: heights}, screen)[0]
+    both = (seen.power > 0) & (landed.power > 0)
+    assert both.sum() > 500 and (seen.power[~both] == 0).all()
+    for mine, other in zip((seen.x, seen.y), landed.origin[:2], strict=True):
+        assert torch.allclose(mine[both], other[both], atol=1e-9)
+    # nearly the same without tilts of the screen, and of parallel light behind lenses in front
+    e = replace(e, screen_tilt=(0.0, 0.0), **({"source_tilt": (0.0, 0.0)} if scene.in_front and source.distant else {}))
+    near = e.upright(scene)
+    (exact,) = landing_points(scene, FIELD, heights, rays, e)
+    (close,) = landing_points(near, FIELD, heights + e.thickness, rays_of(near, "stratified", 2000, 1), Misalignment())
+    (plain,) = landing_points(scene, FIELD, heights, rays_of(scene, "stratified", 2000, 1), Misalignment())
+    lit = (exact.power > 0) & (close.power > 0) & (plain.power > 0)
+    off, without = (torch.hypot(one.x - exact.x, one.y - exact.y)[lit].mean() for one in (close, plain))
+    assert off < 0.1 * without
+
+
+def test_a_robust_design_moves_the_lens_among_the_elements(_here, capfd):
+    Path("errors.toml").write_text(
+        "[lens_shift]\nsigma = [0.2, 0.2]\n[source_tilt]\nsigma = [0.1, 0.1]\n[thickness]\nsigma = 0.05\n"
+    )
+    options = ("--element", FIELD_LENS, "--element", "lens z=60 radius=120,-120 free=back", "--robust", "errors.toml")
+    run(capfd, "design", "one.png", *SMALL, *options, "--iterations", "1", "-o", "p")
+    problem = problem_of(Project.open("p"))
+    assert isinstance(problem, RobustElements)
+    heights = problem.all_surfaces(load("p").heights)
+    loss = problem.objective(0, heights)
+    draws = [(m.objective.scene.mounting, m.added) for m in loss.members[1:]]
+    for ((a, _), one), ((b, _), other) in (draws[:2], draws[2:]):
+        assert a == (-b[0], -b[1]) and any(a)
+        assert torch.equal(one, -other) and not one[0].any() and one[1].any()  # the lens' own thickness
+    found, way = loss(heights), torch.randn(heights.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    step = 1e-5 * way
+    change = (loss(heights + step).loss - loss(heights - step).loss) / 2.0
+    assert change == pytest.approx(float((found.gradient * step).sum()), rel=0.03)
 
 
 def test_a_folded_axis_is_that_of_the_reflected_ray():
@@ -325,6 +463,20 @@ def test_first_surfaces_are_about_as_good_as_without(source, elements):
     assert error(replace(SCENE, source=source, elements=elements)) < bare + 0.07 < 0.12
 
 
+@pytest.mark.parametrize(
+    "elements", [(thick(-30.0, 10.0, (60.0, -60.0), 4.0, 1.5),), (thick(60.0, 26.0, (150.0, -150.0), 6.0, 1.5),)]
+)
+def test_a_ray_file_lights_other_elements_as_its_source_does(elements):
+    at = (0.0, 0.0, -150.0)
+    scene = replace(SCENE, source=Points((at,), cone=4.0), elements=elements, screen=replace(SCREEN, resolution=(8, 8)))
+    measured = replace(scene, source=Measured(RaySet(*cone_of(200_000, 4.0, seed=1)), at))
+    surfaces = [first_surface(replace(s, screen=SCREEN), picture(), FIELD, 96).heights for s in (scene, measured)]
+    images = [expose(s, FIELD, surfaces[0], rays_of(s, "stratified", 200_000)).image for s in (scene, measured)]
+    relief = surfaces[0].std()
+    assert (surfaces[0] - surfaces[1]).std() < 0.05 * relief and images[0].sum() > 0.2
+    assert torch.allclose(*images, atol=5.0 * math.sqrt(float(images[0].max()) / 200_000))
+
+
 def test_light_through_a_field_lens_is_that_of_traced_rays():
     """Power on cells of the exit, by counting rays; all that passes the entrance's aperture is there."""
     scene = replace(SCENE, source=Points(((0.5, 0.0, -90.0),)), elements=(thick(-25.0, 10.0, (40.0, -200.0)),))
@@ -356,6 +508,16 @@ def test_effects_know_of_all_glasses_and_apertures():
     assert float(image.image.sum()) + sum(lost.values()) == pytest.approx(1.0, abs=1e-12)
     narrow = replace(scene, elements=(replace(glass, size=(8.0, 8.0)), replace(scene.elements[1], size=(8.0, 8.0))))
     assert expose(narrow, FIELD, wavy(), rays_of(narrow, "stratified", 20_000)).lost["missed_surface"] > 0.1
+
+
+def test_a_study_of_effects_leaves_out_what_other_elements_exclude():
+    scene = replace(SCENE, elements=(thick(60.0, 26.0, (150.0, -150.0), 6.0, 1.5),))
+    plan = compile_plan(scene, FIELD, wavy())
+    asked = {one.name: one for one in plan.effects if one.name in ("gradient-index", "mirror", "absorption", "fresnel")}
+    rows = {name: _row(one, plan, scene, FIELD, wavy(), 500, 1, 0, torch.float64) for name, one in asked.items()}
+    assert rows.pop("gradient-index") is None and rows.pop("mirror") is None
+    assert len(rows) == 2 and all(row is not None for row in rows.values())
+    assert STUDIES["effects"].capability.supports(scene)
 
 
 @pytest.mark.parametrize("aperture", ["rectangle", "circle"])
@@ -434,24 +596,25 @@ def test_design_render_resume_and_files(_here, capfd):
     lens.export("lens.step")
     text = Path("lens.step").read_text()
     assert text.count("MANIFOLD_SOLID_BREP") == 3 and text.count("B_SPLINE_SURFACE_WITH_KNOTS") == 5
-    for study in ("--report", "--tolerances", "--html"):
-        files = {"--tolerances": ["t.toml"], "--html": ["page.html"]}.get(study, [])
-        Path("t.toml").write_text("[index]\nsigma = 0.001\n")
-        said = run(capfd, "render", "p", study, *files, "--quiet", "--force", code=2)
-        assert "element" in said, study
+    Path("t.toml").write_text("draws = 10\n[lens_shift]\nsigma = [0.2, 0.2]\n[source_tilt]\nsigma = [0.1, 0.1]\n")
+    found = run(capfd, "render", "p", "--report", "--tolerances", "t.toml", "--rays", "20000", "--quiet", "--json")
+    assert found["tolerances"]["sensitivities"][0]["adds"] > 0.01
+    (z, zx, zy), report = lens.surface(*np.meshgrid(*[np.linspace(-5, 5, 101)] * 2, indexing="ij")), found["report"]
+    assert report["minimum_wall_mm"] == pytest.approx(z.min() - lens.scene.lens.z_in, rel=1e-3)
+    assert report["maximum_slope"] == pytest.approx(np.hypot(zx, zy).max(), rel=0.02) and report["sharpness_limit_mm"] is None
+    assert "element" in run(capfd, "render", "p", "--html", "page.html", "--quiet", "--force", code=2)
     assert "single lens" in run(capfd, "export", "p", "--format", "zemax", code=2)
 
 
 def test_a_flat_mirror_excludes_nothing_that_a_lens_has_by_itself(_here, capfd):
-    """Neither page, report, tolerances, a grid for Zemax, studies, ray files nor designs that are robust or on the wave image; a
-    curved mirror does."""
-    flat, curved = ("--element", "mirror z=150 tilt=45,0"), ("--element", "mirror z=150 tilt=45,0 radius=-2000")
+    """Neither page, report, tolerances, a grid for Zemax, studies, ray files nor designs that are robust or on the wave
+    image."""
+    flat = ("--element", "mirror z=150 tilt=45,0")
     Path("t.toml").write_text("draws = 40\n[index]\nsigma = 0.001\n")
     Path("led.tm25ray").write_bytes(tm25(*cone_of(20_000, 8.0, seed=1)))
     led = ("--source", "rays", "--source-file", "led.tm25ray", "--source-position", "0,0,-40")
     made = run(capfd, "design", "one.png", *SMALL, *led, *flat, "--iterations", "2", "-o", "led")
     assert made["relative_rms"] < 0.6 and made["on_screen"] > 0.7
-    assert "cannot be combined" in run(capfd, "design", "one.png", *SMALL, *led, *curved, "-o", "no", code=2)
     run(capfd, "design", "one.png", *SMALL, "--robust", "t.toml", *flat, "--iterations", "2", "-o", "robust")
     made = run(capfd, "design", "one.png", *SMALL, "--waves", "off", *flat, "--iterations", "2", "-o", "p")
     asked = ("--report", "--tolerances", "t.toml", "--html", "page.html", "--rays", "20000", "--effects", "fresnel")
@@ -468,7 +631,6 @@ def test_a_flat_mirror_excludes_nothing_that_a_lens_has_by_itself(_here, capfd):
         patch.setattr("caustic_cli.workflow.design._run", begun)
         assert cli.run(["design", "one.png", *SMALL[:3], "--waves", "on", *flat, "--quiet", "-o", "w"]) == 0
     assert any(stage.get("waves") for stage in tomllib.loads(Path("w/project.toml").read_text())["design"]["stages"])
-    assert "--waves on cannot be" in run(capfd, "design", "one.png", *SMALL, "--waves", "on", *curved, "-o", "no", code=2)
 
 
 def test_an_archive_holds_the_glass_of_every_lens(tmp_path):
@@ -490,15 +652,12 @@ def test_an_archive_holds_the_glass_of_every_lens(tmp_path):
         (("--collimate",), "--collimate cannot be combined with --element"),
         (("--focus", "0,0,900"), "--focus cannot be combined with --element"),
         (("--second", "one.png", "--second-at", "500"), "--second cannot be combined with --element"),
-        (("--robust", "errors.toml"), "--robust errors.toml cannot be combined with --element"),
-        (("--waves", "on"), "--waves on cannot be combined with --element"),
         (("--gradient", "selfoc", "--gradient-terms", "0.02"), "--gradient selfoc cannot be combined with --element"),
         (("--mirror",), "--mirror cannot be combined with --element"),
         (("--element", "lens z=60 free=front", "--network", "sparse"), "--network sparse cannot be combined with [[element]] free"),
     ],
 )
 def test_what_other_elements_exclude_is_named_as_it_was_given(_here, capfd, options, words):
-    Path("errors.toml").write_text("[index]\nsigma = 0.001\n")
     assert words in run(capfd, "design", "one.png", *SMALL, "--element", FIELD_LENS, *options, code=2)
     Path("beside.toml").write_text("[[element]]\nz = -30.0\n")
     said = run(capfd, "design", "one.png", *SMALL, "--config", "beside.toml", "--collimate", code=2)
@@ -590,7 +749,6 @@ def test_bad_elements_are_refused(_here, capfd, text, words):
         ("--mirror",),
         ("--array", "2"),
         ("--gradient", "selfoc", "--gradient-terms", "0.01"),
-        ("--waves", "on"),
         ("--collimate",),
     ],
 )

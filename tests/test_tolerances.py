@@ -144,7 +144,7 @@ def test_the_lens_frame_is_the_rooms():
     rays = rays_of(scene, "stratified", 900, 4)
     (here,) = landing_points(scene, field, heights, rays, ALL)
     system, screen = misaligned.room(scene, field, ALL)
-    stand = ALL.lens_pose(scene)
+    stand = ALL.frame(scene)
     (sample,) = rays.chunks()
     on = RayState.on_axis(sample, scene.lens.half_size, scene.lens.z_in).expanded()
     inside = rotate_to_global(stand, (on.origin[0], on.origin[1], torch.zeros_like(on.power)))

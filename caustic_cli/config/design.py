@@ -92,6 +92,7 @@ def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
         t.spread,
         t.lenslets,
         t.spare,
+        t.exit_alone,
     )
 
 

@@ -22,7 +22,7 @@ _LENSLETS = (
 )
 _TWO_SIDES = {
     **dict.fromkeys(
-        ("lens.mirror", "target.color", "lens.gradient", "lens.array", "design.robust", "design.network", "design.optimizer"),
+        ("lens.mirror", "lens.gradient", "lens.array", "design.network", "design.optimizer"),
         "⟨{path}⟩ cannot be combined with ⟨{feature}⟩, which needs two free-form sides of heights by lbfgs",
     ),
     **dict.fromkeys(("source.also", "source.type rays"), "⟨{feature}⟩ needs one source that is no ray file"),
@@ -42,13 +42,13 @@ EXCLUDED: dict[str, dict[str, str]] = {
         "source.spectrum": "⟨source.spectrum⟩ is not for a coloured picture, whose three wavelengths are its colours",
     },
     **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
+    "second.z": {"target.color": "⟨target.color⟩ cannot be combined with ⟨second.file⟩: the second picture has no colours"},
     "element": {
         **dict.fromkeys(TRAITS["two sides"].settings, "⟨{path}⟩" + NOT_BESIDE),
         "lens.gradient": "{said}" + NOT_BESIDE,
     },
-    "element.reshapes": dict.fromkeys(("design.robust", "design.waves on"), "{said}" + NOT_BESIDE),
     "element.free": dict.fromkeys(
-        ("design.network", "design.optimizer", "target.color"),
+        ("design.network", "design.optimizer", "target.color", "design.waves on"),
         "{said} cannot be combined with ⟨element.free⟩: it is not implemented beside other free surfaces",
     ),
     "lens.gradient free": {

@@ -5,7 +5,8 @@
 with w_0 = 1 - WEIGHT and equal weights otherwise.  The draws are a Latin hypercube, independent of that of a tolerance study, in
 antithetic pairs, so that every error has zero mean.  The scene of a draw is the nearest one with an upright screen
 (`Misalignment.upright`): rotations of the picture or the screen, roughness and the aperture are
-left out.
+left out, and the direction of light behind a field lens.  Of several free-form surfaces each has form errors of its own; the
+thickness is that of the lens.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
@@ -39,14 +41,15 @@ def robust_objective(
 
     Args:
         objective: returns the loss in a scene, near heights (n, m) mm.
-        scene, field: without errors; initial: heights at the beginning of the stage, (n, m) mm.
+        scene, field: without errors; initial: heights at the beginning of the stage, (n, m) mm, or (k, n, m) of all free surfaces.
         tolerances: the errors.
 
     Raises:
         InputError: none of the errors applies to the scene.
     """
     scene = scene.unfolded
-    parameters = tuple(p for p in tolerances.parameters if p.error not in OMITTED and not reason_ignored(scene, p.error))
+    omitted = (*OMITTED, *(["source_tilt"] if scene.in_front else []))
+    parameters = tuple(p for p in tolerances.parameters if p.error not in omitted and not reason_ignored(scene, p.error))
     fits = tolerances.surface and _resolves(field, tolerances.shortest)
     if not (parameters or fits):
         raise InputError("⟨design.robust⟩ names no error that a design can take into account in this scene")
@@ -55,11 +58,13 @@ def robust_objective(
     seen = 1.0 / (count + 1)
     members = [Member(objective(scene, initial), 1.0 - WEIGHT, seen, 1.0)]
     for row in hypercube(parameters, PAIRS, tolerances.seed, PURPOSE):
-        surface = surfaces.heights(rng, tolerances.surface) if surfaces else 0.0
+        surface = torch.stack([surfaces.heights(rng, tolerances.surface) for _ in scene.free_surfaces]) if surfaces else 0.0
         for sign in (-1.0, 1.0):
             values = {(p.error, p.axis): sign * float(v) for p, v in zip(parameters, row, strict=True)}
             errors = Misalignment.of(values)
-            added = sign * surface + errors.thickness
+            added = torch.zeros(len(scene.free_surfaces), *field.shape, dtype=torch.float64) + sign * surface
+            added[-1] += errors.thickness
+            added = added if scene.joint else added[0]
             members.append(Member(objective(errors.upright(scene), initial + added), WEIGHT / count, seen, 0.0, added=added))
     return Mixture(members, POWER)
 

@@ -26,7 +26,7 @@ SHARP = 2e-2
 
 
 class TwoSidedObjective(Objective):
-    """The loss as a function of the heights of entrance and exit, (2, n, m) mm.
+    """The loss as a function of the heights of entrance and exit, (2, n, m) mm; in a scene with an entrance, of the exit alone.
 
     Args:
         scene: with a `second`; field: spline spaces of both sides; sampler: the rays, the same at every evaluation.
@@ -54,15 +54,20 @@ class TwoSidedObjective(Objective):
 
     def _see(self, traced: Tracer, parameters: Parameters) -> list[Tensor]:
         """For a single picture, the last is the sum of power times squared angle to the prescribed direction."""
+        if traced.fused is not None and not self.further:
+            images = [traced.expose(parameters, channel.screen, channel.how.filter) for channel in self.channels]
+            return [channel.pooled(image.image) for channel, image in zip(self.channels, images, strict=True)] + [images[0].leaving]
         states = traced(parameters)
         images = [traced.collect(states, channel.screen, channel.how.filter) for channel in self.channels]
         found = [channel.pooled(image.image) for channel, image in zip(self.channels, images, strict=True)] + [images[0].leaving]
         if len(images) == 1:
-            found.append(traced.weight * squared_angular_error(traced, states[0], self.scene))
+            found.append(traced.of_color(traced.weight * squared_angular_error(traced, states[0], self.scene)))
         return found
 
     def _penalty(self, parameters: Parameters) -> Tensor:
-        """Penalties of both surfaces, each from outside the glass."""
+        """Penalties of the surfaces that are designed, each from outside the glass."""
+        if ENTRANCE not in parameters:
+            return self.penalty(parameters[EXIT])
         return self.penalty(parameters[EXIT]) + self.penalty(self.penalty.base - parameters[ENTRANCE])
 
     def _loss(self, seen: list[Tensor], sums: list[Tensor], penalty: Tensor, entering: Tensor) -> Tensor:
@@ -71,7 +76,7 @@ class TwoSidedObjective(Objective):
             (channel.loss(image, leaving, entering=entering) * channel.loss.target.numel()).square()
             for channel, image in zip(self.channels, seen, strict=True)
         ]
-        first, other = *terms, *(angle / (leaving * SHARP**2) for angle in angles)
+        first, other = *terms, *(angle.sum() / (leaving.sum() * SHARP**2) for angle in angles)
         square, pixels = 0.5 * (first + other) + penalty, self.loss.target.numel()
         if not float(square.detach()) > 0:
             return square / pixels  # zero loss: the square root has no derivative there, its square has

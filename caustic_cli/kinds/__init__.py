@@ -17,7 +17,9 @@ from caustic_cli.kinds.surface import Described, OneSurface
 #: is of the first that applies.
 KINDS = (
     ("lens.gradient", "gradient_index.IndexPlate"),
+    ("design.robust", "robust.RobustTwoSides"),
     ("second", "two_sided.TwoSides"),
+    ("design.robust", "robust.RobustElements"),
     ("element", "elements.FreeElements"),
     ("design.over", "network_range.NetworkAmongElements"),
     ("design.over", "network_range.NetworkOverRange"),

@@ -9,9 +9,10 @@ from torch import Tensor
 from caustic_cli.config.settings import Settings
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.robust import robust_objective
-from caustic_cli.kinds.elements import AmongElements
+from caustic_cli.kinds.elements import AmongElements, FreeElements
 from caustic_cli.kinds.lenslet_array import LensletArray
 from caustic_cli.kinds.surface import Described, OneSurface
+from caustic_cli.kinds.two_sided import TwoSides
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.section import content
 from caustic_cli.scene.tolerances import Tolerances
@@ -51,7 +52,15 @@ class RobustSurface(OneSurface):
 
 
 class RobustAmongElements(RobustSurface, AmongElements):
-    """One surface behind which mirrors fold the axis, robust."""
+    """One surface among other elements, robust."""
+
+
+class RobustElements(RobustSurface, FreeElements):
+    """Surfaces of several elements, robust."""
+
+
+class RobustTwoSides(RobustSurface, TwoSides):
+    """Entrance and exit, robust."""
 
 
 class RobustArray(RobustSurface, LensletArray):

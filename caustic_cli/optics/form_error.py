@@ -10,6 +10,7 @@ or a refined one in which knot insertion reproduces the same surface.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from torch import Tensor
 from caustic_cli.errors import InputError, at_least
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.system import fixed_surface, freeform_of
+from caustic_cli.scene import FreeForm, Scene
 from caustic_cli.scene.tolerances import FormError, Waviness
 
 #: Period of a realisation, in aperture sizes.
@@ -73,6 +76,45 @@ def _collocation(space: SplineSpace, at: Tensor) -> sparse.csr_array:
 def _interpolation(space: SplineSpace):
     """A function: values at the Greville abscissae (n, ...) -> control heights."""
     return linalg.splu(sparse.csc_matrix(_collocation(space, space.greville))).solve
+
+
+class OtherSurfaces:
+    """Form errors of the designed surfaces of a scene beside the lens' exit: its entrance, and those of other elements.
+
+    Args:
+        scene: with their heights.
+        form, waviness, shortest: the statistics of each, independent of the others.
+
+    Raises:
+        InputError: as of `FormErrors` and `refined`.
+    """
+
+    def __init__(self, scene: Scene, form: FormError | None, waviness: Waviness | None, shortest: float):
+        self.scene, self.made = scene, dict[int, tuple[HeightField, Tensor, FormErrors]]()
+        parts = [(scene.lens.entrance, scene.lens.half_size), *((s, e.half_size) for e in scene.elements for s in e.surfaces)]
+        for surface, half in parts:
+            if surface is not None:
+                fixed = fixed_surface(surface, half)
+                field, heights = refined(fixed.field, fixed.heights, shortest)
+                self.made[id(surface)] = field, heights, FormErrors(field, form, waviness)
+
+    def realised(self, rng: np.random.Generator, which: tuple[str, ...]) -> Scene:
+        """The scene with a realisation of these errors, form_error, waviness or both, on each of the surfaces."""
+
+        def erroneous(surface: FreeForm | None) -> FreeForm | None:
+            if surface is None:
+                return None
+            field, heights, errors = self.made[id(surface)]
+            return freeform_of(field, heights + errors.heights(rng, which))
+
+        if not self.made:
+            return self.scene
+        lens = replace(self.scene.lens, entrance=erroneous(self.scene.lens.entrance))
+        elements = tuple(
+            replace(e, surfaces=(erroneous(e.surfaces[0]), erroneous(e.surfaces[1]))) if any(e.surfaces) else e
+            for e in self.scene.elements
+        )
+        return replace(self.scene, lens=lens, elements=elements)
 
 
 class FormErrors:

@@ -71,6 +71,21 @@ class AxisSegment:
         return AxisSegment((x, y, w), frame)
 
 
+def seen_from(held: Pose, pose: Pose) -> Pose:
+    """A global pose in the frame `held`."""
+    origin = tuple(p - h for p, h in zip(pose.position, held.position, strict=True))
+    return _posed(rotate_to_local(held, origin), [rotate_to_local(held, axis) for axis in pose.axes])
+
+
+def carried(held: Pose, pose: Pose) -> Pose:
+    """The global pose of what has this pose in the frame `held`."""
+    return _posed(to_global(held, pose.position, 0.0), [rotate_to_global(held, axis) for axis in pose.axes])
+
+
+def _posed(position, axes) -> Pose:
+    return Pose(tuple(position), frame=tuple(axes))  # type: ignore[arg-type]
+
+
 def to_local(pose: Pose, origin, direction, datum: float) -> tuple[tuple, tuple]:
     """Ray origins and directions in an element's frame, from global ones."""
     px, py, pz = pose.position

@@ -6,6 +6,7 @@ but refraction with Fresnel losses happens to them, or reflection of parallel li
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeGuard
 
 from caustic_cli.optics.backends import Fused
@@ -26,6 +27,7 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
     element = system.elements[-1]
     if _needs_stages(tracer) or tracer.first != len(system.elements) - 1 or not _is_plain(element, system.pupil):
         return None
+    start = _in_a_plane(start)
     if tracer.sides[-1] < 0 or not _are_plain(start) or not (system.lit or tracer.first):
         return None
     eta = inside.index_at(start.wavelength) / outside.index_at(start.wavelength)
@@ -81,6 +83,17 @@ def _is_upright(element: Element, pupil: Pupil) -> bool:
         and element.pose == Pose()
         and element.aperture.half_size == surface.half_size == pupil.half_size
     )
+
+
+def _in_a_plane(rays: RayState) -> RayState:
+    """Rays as they cross the plane z = `datum`, on their lines: in front of the last surface nothing else happens to them."""
+    x, y, z = rays.origin
+    if isinstance(z, float):
+        return rays
+    rays = rays.expanded()
+    dx, dy, dz = rays.direction
+    t = -z / dz
+    return replace(rays, origin=(x + t * dx, y + t * dy, 0.0))
 
 
 def _are_plain(rays: RayState) -> bool:

@@ -1,9 +1,10 @@
 """Ray tracing of a scene with given manufacturing and alignment errors.
 
-Everything is traced in the frame of the lens.  Source and screen are transformed into it, p' = R (p - c - d) + c, with the lens'
-axes as rows of R, its decentre d and the centre c of its entrance.  Rays are sampled on the lens' aperture as usual, and rays of
-one seed have the same points there for all errors (common random numbers), so the difference of two images is due to the errors
-alone.
+Everything is traced in the frame of what the source illuminates first.  That is the lens, if no other element is in front of it:
+source, screen and other elements are transformed into its frame, p' = R (p - c - d) + c, with the lens' axes as rows of R, its
+decentre d and the centre c of its entrance.  Behind other elements the lens itself is moved (`Scene.mounting`).  Rays
+are sampled on the aperture of that first element as usual, and rays of one seed have the same points there for all errors (common
+random numbers), so the difference of two images is due to the errors alone.
 
 Light from infinity arrives in the direction given by its own and the lens' tilt, over the whole aperture.  A profile of its
 irradiance belongs to the beam: it moves over the aperture by the decentre of the source less that of the lens (to first order in
@@ -26,14 +27,14 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import Rays, of_member
 from caustic_cli.optics.emission.base import relative_flux
-from caustic_cli.optics.frames import Pose, rotate_to_global, rotate_to_local
+from caustic_cli.optics.frames import AxisSegment, Pose, rotate_to_global, rotate_to_local
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.resampling import displaced
 from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import CHUNK, Tracer
-from caustic_cli.scene import Pupil, Scene, Source
+from caustic_cli.scene import Pupil, Scene, Screen, Source
 from caustic_cli.scene.screen import Window, passed_by
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.several import Several
@@ -69,13 +70,15 @@ class Misalignment:
                 found[f.name] = float(values.get((f.name, 0), 0.0))
         return cls(**found)
 
-    def lens_pose(self, scene: Scene) -> Pose:
-        """Pose of the lens: rotated about the centre of its entrance, and decentred."""
-        return Pose((*self.lens_shift, scene.lens.z_in), self.lens_tilt)
+    def frame(self, scene: Scene) -> Pose:
+        """Pose, with the centre of the lens' entrance as origin, of the frame in which everything is traced: that of the lens,
+        rotated about this point, and decentred; without errors, if other elements are in front of the lens."""
+        centre = 0.0, 0.0, scene.lens.z_in
+        return Pose(centre) if scene.in_front else Pose((*self.lens_shift, centre[2]), self.lens_tilt)
 
     def point(self, scene: Scene, point: Sequence[float]) -> tuple[float, float, float]:
-        """A point of the scene in the frame of the lens, mm."""
-        pose = self.lens_pose(scene)
+        """A point of the scene in that frame, mm."""
+        pose = self.frame(scene)
         x, y, z = rotate_to_local(pose, tuple(p - o for p, o in zip(point, pose.position, strict=True)))
         return x, y, z + scene.lens.z_in
 
@@ -88,24 +91,25 @@ class Misalignment:
         return x, y, z
 
     def screen(self, scene: Scene) -> tuple[tuple[float, float, float], tuple]:
-        """Centre, mm, and axes of the screen in the frame of the lens."""
-        s, pose, away = scene.screen, self.lens_pose(scene), self.away(scene)
+        """Centre, mm, and axes of the screen in the frame of the trace."""
+        s, pose, away = scene.screen, self.frame(scene), self.away(scene)
+        leg = System.of(scene).leg or AxisSegment()
         tilt = (s.tilt[0] + self.screen_tilt[0], s.tilt[1] + self.screen_tilt[1], *s.tilt[2:])
         centre = (s.shift[0] + self.screen_shift[0] + away[0], s.shift[1] + self.screen_shift[1] + away[1], s.z + away[2])
-        axes = tuple(rotate_to_local(pose, s.in_space(axis)) for axis in Pose(tilt=tilt).axes)
-        return self.point(scene, s.in_space(centre)), axes
+        axes = tuple(rotate_to_local(pose, s.in_space(axis)) for axis in Pose(tilt=tilt, frame=leg.frame).axes)
+        return self.point(scene, s.in_space(leg.at(*centre))), axes
 
     def windows(self, scene: Scene) -> list[Window]:
-        """The windows in front of the screen in the frame of the lens."""
-        pose = self.lens_pose(scene)
+        """The windows in front of the screen in the frame of the trace."""
+        pose = self.frame(scene)
         return [
             replace(w, vertex=self.point(scene, w.vertex), axes=cast(Any, tuple(rotate_to_local(pose, axis) for axis in w.axes)))
             for w in scene.screen.windows
         ]
 
     def scene(self, scene: Scene) -> Scene:
-        """The scene with the erroneous index, wavelength, source position and source size, in the frame of the lens; the direction
-        of light from infinity and the screen are unchanged.
+        """The scene with the erroneous index, wavelength, source position and source size, and, among other elements, place of the
+        lens, in the frame of the trace; the direction of light from infinity and the screen are unchanged.
 
         Raises:
             InputError: the scene is invalid with these errors.
@@ -113,7 +117,9 @@ class Misalignment:
         lens = replace(scene.lens, index=scene.lens.index + self.index) if self.index else scene.lens
         light = replace(scene.light, wavelengths=tuple((1.0 + self.wavelength) * w for w in scene.light.wavelengths))
         try:
-            return replace(scene, lens=lens, light=light, source=self._source(scene, scene.source))
+            moved = scene.elements and any((*self.lens_shift, *self.lens_tilt))
+            mounting = (self.lens_shift, self.lens_tilt) if moved else scene.mounting
+            return replace(scene, lens=lens, light=light, source=self._source(scene, scene.source), mounting=mounting)
         except InputError as error:
             raise InputError(f"with these errors the scene is invalid: {error}") from error
 
@@ -127,33 +133,58 @@ class Misalignment:
         if isinstance(source, Several):
             return replace(source, members=tuple(self._source(scene, one) for one in source.members))
         if source.profile is not None:
-            aside = [s - d for s, d in zip(self.source_shift, self.lens_shift, strict=True)]
+            aside = [s - d for s, d in zip(self.source_shift, self.frame(scene).position, strict=False)]
             if not any(aside):
                 return source
             across, along = (d / (2.0 * r) for d, r in zip(aside, scene.pupil.half_size, strict=True))
             return replace(cast(Any, source), profile=displaced(source.profile, (across, along)))
         if isinstance(source, Measured):
             rays = source.turned
-            if any(self.lens_tilt):
-                rays = rays.turned(np.array(self.lens_pose(scene).axes).T)
+            if any(self.frame(scene).tilt):
+                rays = rays.turned(np.array(self.frame(scene).axes).T)
             return replace(source, rays=rays, position=moved(source.origin.tolist()), tilt=(0.0, 0.0))
-        return source.displaced(moved, scale, rotate_to_local(self.lens_pose(scene), source.axis))
+        return source.displaced(moved, scale, rotate_to_local(self.frame(scene), source.axis))
 
     def upright(self, scene: Scene) -> Scene:
         """An approximately equivalent scene with the lens in its nominal position, without the thickness error.
 
         Light from infinity is parallel to the axis, and the screen is decentred by the shift of the picture that its direction
-        causes, without additional tilt.
+        causes, without additional tilt; the same holds for a second picture and a focus.  Among other
+        elements the lens stands where it does; light from infinity that a thin lens receives at an angle is replaced by a rotation
+        of all that is behind, and that which other elements receive so is parallel to the axis.
 
         Raises:
             InputError: as of `scene`.
         """
-        changed, ((x, y, z), _) = self.scene(scene), self.screen(scene)
-        if scene.source.distant:
-            ahead = rotate_to_local(self.lens_pose(scene), rotate_to_global(Pose(tilt=self.source_tilt), (0.0, 0.0, 1.0)))
+        changed, ahead = self.scene(scene), self._ahead(scene)
+        if scene.elements:
+            turned = self.source_tilt if scene.source.distant and not scene.in_front else self.lens_tilt
+            (sx, sy), (dx, dy), (x, y, z) = scene.screen.shift, self.screen_shift, self.away(scene)
+            screen = replace(scene.screen, z=scene.screen.z + z, shift=(sx + dx + x, sy + dy + y))
+            return replace(changed, screen=screen, mounting=(self.lens_shift, turned))
+
+        def seen(point: Sequence[float]) -> tuple[float, float, float]:
+            x, y, z = point
             reach = abs(z - scene.lens.offset.thickness)  # light from a mirror returns, with the same lateral shift
-            x, y = x - reach * ahead[0] / ahead[2], y - reach * ahead[1] / ahead[2]
-        return replace(changed, screen=replace(scene.screen, z=z, shift=scene.screen.in_space((x, y, z))[:2]))
+            return x - reach * ahead[0], y - reach * ahead[1], z
+
+        def moved(screen: Screen) -> Screen:
+            x, y, z = seen(self.screen(scene.onto(screen))[0])
+            return replace(screen, z=z, shift=screen.in_space((x, y, z))[:2])
+
+        second = scene.second_target
+        if second is not None and second.screen is not None:
+            second = replace(second, screen=moved(second.screen))
+        elif second is not None and second.focus is not None:
+            second = replace(second, focus=seen(self.point(scene, second.focus)))
+        return replace(changed, screen=moved(scene.screen), second_target=second)
+
+    def _ahead(self, scene: Scene) -> tuple[float, float]:
+        """Slopes of light from infinity by the tilts of source and lens, in the frame of the trace; 0 of other light."""
+        if not scene.source.distant:
+            return 0.0, 0.0
+        x, y, z = rotate_to_local(self.frame(scene), rotate_to_global(Pose(tilt=self.source_tilt), (0.0, 0.0, 1.0)))
+        return x / z, y / z
 
     def brightness(self, scene: Scene, changed: Scene) -> float:
         """Factor of the power, of a scene with a single source, that keeps the irradiance of a beam with a profile, of which
@@ -164,7 +195,7 @@ class Misalignment:
             return changed.source.passed(scene.pupil) / before.passed(scene.pupil)
         if before.distant or before.cone is not None or before.rays is not None:
             return 1.0
-        after, whole = (relative_flux(s.source, s.source.cone_over(s.lens.pupil)) for s in (changed, scene))
+        after, whole = (relative_flux(s.source, s.source.cone_over(s.pupil)) for s in (changed, scene))
         return after / whole
 
     def stopped(self, pupil: Pupil, state: RayState) -> RayState:
@@ -181,10 +212,11 @@ class Misalignment:
 
     def directed(self, scene: Scene, source: Source, state: RayState) -> RayState:
         """Rays of light from infinity rotated by the tilts of source and lens; other rays unchanged."""
-        if not source.distant or not (any(self.source_tilt) or any(self.lens_tilt)):
+        frame = self.frame(scene)
+        if not source.distant or not (any(self.source_tilt) or any(frame.tilt)):
             return state
         state = state.expanded()
-        direction = rotate_to_local(self.lens_pose(scene), rotate_to_global(Pose(tilt=self.source_tilt), state.direction))
+        direction = rotate_to_local(frame, rotate_to_global(Pose(tilt=self.source_tilt), state.direction))
         return replace(state, direction=direction, sample=None)
 
 

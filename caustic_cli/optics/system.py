@@ -19,7 +19,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.frames import AxisSegment, Pose
+from caustic_cli.optics.frames import AxisSegment, Pose, carried, rotate_to_global, seen_from
 from caustic_cli.optics.media import AIR, Medium, medium_of
 from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Sphere, Surface
 from caustic_cli.optics.tolerances import PARALLEL
@@ -94,6 +94,17 @@ def split_heights(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Sc
         for k, e in enumerate(scene.elements)
     )
     return replace(scene, lens=lens, elements=elements), heights[-1]
+
+
+def lens_frame(scene: Scene) -> Pose:
+    """The frame of the lens as it stands relative to the other elements (`Scene.mounting`)."""
+    shift, tilt = scene.mounting
+    if not any((*shift, *tilt)):
+        return Pose()
+    middle = (0.0, 0.0, scene.lens.z_in)
+    turned = rotate_to_global(Pose(tilt=tilt), middle)
+    x, y, z = (m + d - t for m, d, t in zip(middle, (*shift, 0.0), turned, strict=True))
+    return Pose((x, y, z), tilt)
 
 
 def trace_arguments(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, HeightField, Tensor]:
@@ -195,6 +206,13 @@ class System:
             elements = (first, *elements)
         lit, leg = None if scene.two_sided or scene.in_front else scene.pupil, AxisSegment()
         in_front = tuple(e for k, c in enumerate(scene.in_front) for e in _elements_of(c, k, leg, scene, surface.spaces))
+        stands = lens_frame(scene)
+        if stands != Pose():
+            if in_front:  # which the source illuminates: everything is in their frame, and otherwise in that of the lens
+                elements = tuple(replace(e, pose=carried(stands, e.pose)) for e in elements)
+            else:
+                around = seen_from(stands, Pose())
+                leg = AxisSegment(around.position, around.frame)
         elements = (*in_front, *elements)
         for k, component in enumerate(scene.behind, len(scene.in_front)):
             elements += tuple(_elements_of(component, k, leg, scene, surface.spaces))

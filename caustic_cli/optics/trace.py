@@ -119,7 +119,7 @@ class Tracer:
         #: Power through the pupil, (), where a fused pencil knows it without a trace of the rays in front of the lens.
         self.lit: Tensor | None = getattr(self.fused, "entering", None)
         #: Power through the pupil, () or, with colours, (3,).
-        self.entering = self._of_color(weight * (self._front.entering if self.lit is None else self.lit))
+        self.entering = self.of_color(weight * (self._front.entering if self.lit is None else self.lit))
 
     @cached_property
     def _front(self) -> Front:
@@ -223,10 +223,18 @@ class Tracer:
         """The direct light at the last element."""
         return cast(Interaction, [self._front.behind, *self._interactions(parameters)][-1])  # a system has at least one element
 
+    def ends(self, parameters: Parameters) -> tuple[Interaction, Interaction]:
+        """The direct light at a lens' exit, at the last element if there is none, and at the last element."""
+        exit, last = None, self._front.behind
+        for last in self._interactions(parameters):
+            exit = last if last.element.name == EXIT else exit
+        assert last is not None  # a system has at least one element
+        return exit or last, last
+
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
         """Rays at a lens' exit in its frame: slopes of the surface, directions in front of it, powers in front of it."""
-        exit = next((m for m in self._interactions(parameters) if m.element.name == EXIT), None) or self.last(parameters)
+        exit, _ = self.ends(parameters)
         assert exit.power_in is not None
         return exit.hit.slopes, exit.hit.incoming, exit.power_in
 
@@ -274,9 +282,9 @@ class Tracer:
         w = self.weight
         if w != 1.0:
             image, leaving, lost = w * image, w * leaving, {name: w * value for name, value in lost.items()}
-        return Image(self._of_color(image), self._of_color(leaving), lost, self.count)
+        return Image(self.of_color(image), self.of_color(leaving), lost, self.count)
 
-    def _of_color(self, value: Tensor) -> Tensor:
+    def of_color(self, value: Tensor) -> Tensor:
         """`value` in this light's colour channel of three; unchanged without colours."""
         if self.channel is None:
             return value

@@ -14,7 +14,6 @@ from caustic_cli.scene import sources
 from caustic_cli.scene.aperture import Aperture, CircularAperture, Pupil
 from caustic_cli.scene.elements import (
     BESIDE_ELEMENTS,
-    BESIDE_LENSES,
     COMPONENTS,
     Component,
     FoldMirror,
@@ -86,6 +85,9 @@ class Scene:
     #: Other lenses and fold mirrors, in the order in which light reaches them; behind a mirror, z and the screen refer to the
     #: folded axis.
     elements: tuple[Component, ...] = ()
+    #: Where the lens stands relative to the other elements, which errors change: its decentre along x and y, mm, and its rotations
+    #: about x and y through the centre of its entrance, degrees.
+    mounting: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
 
     def __post_init__(self):
         self._check_elements()
@@ -115,8 +117,6 @@ class Scene:
         if self.elements:
             BESIDE_ELEMENTS.refuse(self)
             check_positions(self.elements, (self.lens.z_in, self.lens.offset.thickness), self.source.nearest, self.screen.z)
-            if self.unfolded is self:
-                BESIDE_LENSES.refuse(self)
 
     @property
     def second_setting(self) -> str:

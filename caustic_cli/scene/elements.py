@@ -273,4 +273,3 @@ BESIDE_ELEMENTS = Capability(
         "far field": "⟨+throw⟩ inf, a picture in the far field," + NOT_BESIDE,
     },
 )
-BESIDE_LENSES = Capability("other lenses and curved mirrors", {"ray file": "⟨source.type⟩ rays" + NOT_BESIDE})

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.effort import STANDARD, Effort, current_effort
+from caustic_cli.errors import InputError
 from caustic_cli.optics.effects import EFFECTS, Decision, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.image import Image
@@ -274,7 +275,10 @@ def _row(
 ) -> dict | None:
     name, amount, bare = effect.name, OWN, None
     if not effect.present:
-        made = None if BY_NAME[name].of_glass and scene.lens.mirror else BY_NAME[name].probe(scene, heights)
+        try:
+            made = None if BY_NAME[name].of_glass and scene.lens.mirror else BY_NAME[name].probe(scene, heights)
+        except InputError:  # which this scene cannot have, such as a gradient index beside other elements
+            return None
         if made is None:
             return None
         scene, bare, amount = made.scene, made.baseline, made.words

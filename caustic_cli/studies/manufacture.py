@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,9 +25,9 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.system import EXIT, System, entrance_of
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Aperture, Scene
+from caustic_cli.scene import Aperture, Lens, Scene
 from caustic_cli.scene.materials import material
 from caustic_cli.scene.traits import Capability
 
@@ -52,11 +53,12 @@ NOT_OF: dict[str, tuple[str, ...]] = {
 def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: float | None = None, seed: int = 0) -> dict:
     """Figures for JSON; None where one does not apply (no concave region, a mirror).  The blur of a point source is 0.
 
-    Keys: minimum_wall_mm and _bound_mm, from the flat entrance; stock_height_mm, least height of a blank; volume_cm3 and, of a
-    known material, mass_g; maximum_slope and _bound; smallest_concave_radius_mm and its position (x, y) mm; tool_radius_mm and
-    tool_fits if one was given; critical_angle_deg, steepest_incidence_deg inside the lens and internal_reflection_margin_deg;
-    sharpness_limit_mm and _pixels, of the source's size; landing_mm_per_mm_throw and landing_mm_per_thousandth_index, root mean
-    square over the light, and the errors that displace the light by one pixel, throw_error_of_a_pixel_mm and
+    Keys: minimum_wall_mm and _bound_mm, along the axis; stock_height_mm, least height of a blank; volume_cm3 and, of a
+    known material, mass_g; maximum_slope and _bound; smallest_concave_radius_mm and its position (x, y) mm, seen from outside the
+    glass; of a free-form entrance, entrance, with these of that side; tool_radius_mm and tool_fits, every side, if one was given;
+    critical_angle_deg, steepest_incidence_deg inside the lens and internal_reflection_margin_deg; sharpness_limit_mm and _pixels,
+    of the source's size, None among other elements; landing_mm_per_mm_throw and landing_mm_per_thousandth_index, root mean square
+    over the light, and the errors that displace the light by one pixel, throw_error_of_a_pixel_mm and
     index_error_of_a_pixel; and screen_unit, of lengths on the screen.
 
     Raises:
@@ -66,28 +68,27 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         raise InputError(f"⟨tool_radius⟩ must be greater than 0 mm, got {tool_radius:g}")
     lens, pixel = scene.lens, max(scene.screen.pixel)
     z, *derivatives = sampled(field, heights, [_points(s) for s in field.spaces])
-    inside, at = _within(lens.opening, z), tuple(n // 2 for n in z.shape)
-    z, *derivatives = (torch.where(inside, t, t[at]) for t in (z, *derivatives))  # points outside are replaced by the centre
-    bends = curvature.largest(*(lens.cut_from * d for d in derivatives))
-    bent, at = float(bends.max()), divmod(int(bends.argmax()), bends.shape[1])
-    where = [(2.0 * k / (n - 1) - 1.0) * r for k, n, r in zip(at, z.shape, field.half_size, strict=True)]
-    radius = 1.0 / bent if bent > 0 else None
-    volume = 1e-3 * float(z[inside].mean() - lens.z_in) * math.prod(lens.size) * (lens.opening.filled / 4.0)
+    inside = _within(lens.opening, z)
+    z, below = z[inside], _below(lens, field)[inside]
+    side = _shape(field, heights, derivatives, inside, lens.cut_from)
     found = {
-        "minimum_wall_mm": float(z.min()) - lens.z_in,
-        "minimum_wall_bound_mm": float(heights.min()) - lens.z_in,
-        "stock_height_mm": float(z.max()) - lens.z_in,
-        "volume_cm3": volume,
-        "mass_g": None if lens.glass is None or (density := material(lens.glass).density) is None else volume * density,
-        "maximum_slope": float(torch.hypot(*derivatives[:2]).max()),
-        "maximum_slope_bound": field.slope_bound(heights),
-        "smallest_concave_radius_mm": radius,
-        "smallest_concave_radius_at_mm": where if radius else None,
+        "minimum_wall_mm": float((z - below).min()),
+        "minimum_wall_bound_mm": float(heights.min()) - _highest_entrance(lens),
+        "stock_height_mm": float(z.max() - below.min()),
+        "volume_cm3": 1e-3 * float((z - below).mean()) * math.prod(lens.size) * (lens.opening.filled / 4.0),
     }
+    density = None if lens.glass is None else material(lens.glass).density
+    found |= {"mass_g": None if density is None else found["volume_cm3"] * density} | side
+    if lens.entrance is not None:
+        fixed = entrance_of(lens)
+        _, *derivatives = sampled(fixed.field, fixed.heights, [_points(s) for s in fixed.field.spaces])
+        inside = _within(lens.opening, derivatives[0])
+        found["entrance"] = _shape(fixed.field, fixed.heights, derivatives, inside, -1)
     if tool_radius is not None:
-        found |= {"tool_radius_mm": tool_radius, "tool_fits": radius is None or radius >= tool_radius}
+        radii = [one["smallest_concave_radius_mm"] for one in (side, found.get("entrance", side))]
+        found |= {"tool_radius_mm": tool_radius, "tool_fits": all(radius is None or radius >= tool_radius for radius in radii)}
     critical, incidence = math.degrees(math.asin(1.0 / lens.index)), _steepest_incidence(scene, field, heights, seed)
-    blur = scene.source.blur(lens.z_in, abs(scene.screen.z - lens.z_in))
+    blur = None if scene.unfolded.elements else scene.source.blur(lens.z_in, abs(scene.screen.z - lens.z_in))
     throw = STEP * abs(scene.screen.z)
     by_throw = _moved(scene, scene, field, heights, seed, throw) / throw
     other = replace(scene, lens=replace(lens, index=lens.index + STEP))
@@ -97,7 +98,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         "steepest_incidence_deg": incidence,
         "internal_reflection_margin_deg": critical - incidence,
         "sharpness_limit_mm": blur,
-        "sharpness_limit_pixels": blur / pixel,
+        "sharpness_limit_pixels": None if blur is None else blur / pixel,
         "screen_unit": scene.screen.unit,
         "landing_mm_per_mm_throw": by_throw,
         "landing_mm_per_thousandth_index": 1e-3 * by_index,
@@ -105,6 +106,35 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         "index_error_of_a_pixel": pixel / by_index if by_index > 0 else None,
     }
     return found | dict.fromkeys(NOT_OF[lens.kind])
+
+
+def _shape(field: HeightField, heights: Tensor, derivatives: list[Tensor], inside: Tensor, cut_from: int) -> dict[str, Any]:
+    """Slopes and concave radii of a free-form side that is cut from +z (1) or from -z (-1), of those at the points `inside`."""
+    at = tuple(n // 2 for n in inside.shape)
+    derivatives = [torch.where(inside, d, d[at]) for d in derivatives]  # points outside are replaced by the centre
+    bends = curvature.largest(*(cut_from * d for d in derivatives))
+    bent, at = float(bends.max()), divmod(int(bends.argmax()), bends.shape[1])
+    where = [(2.0 * k / (n - 1) - 1.0) * r for k, n, r in zip(at, bends.shape, field.half_size, strict=True)]
+    return {
+        "maximum_slope": float(torch.hypot(*derivatives[:2]).max()),
+        "maximum_slope_bound": field.slope_bound(heights),
+        "smallest_concave_radius_mm": 1.0 / bent if bent > 0 else None,
+        "smallest_concave_radius_at_mm": where if bent > 0 else None,
+    }
+
+
+def _below(lens: Lens, field: HeightField) -> Tensor:
+    """z of the entrance at the points at which the exit is sampled, mm."""
+    shape = [_points(s) for s in field.spaces]
+    if lens.entrance is None:
+        return torch.full(shape, lens.z_in, dtype=torch.float64)
+    fixed = entrance_of(lens)
+    return lens.z_in + sampled(fixed.field, fixed.heights, shape, ((0, 0),))[0]
+
+
+def _highest_entrance(lens: Lens) -> float:
+    """Upper bound of z over the entrance, mm."""
+    return lens.z_in + (0.0 if lens.entrance is None else entrance_of(lens).hull(None)[1])
 
 
 def _within(aperture: Aperture, z: Tensor) -> Tensor:
@@ -115,17 +145,18 @@ def _within(aperture: Aperture, z: Tensor) -> Tensor:
 
 WALL = Capability(
     "wall and stock of a design",
-    {"mirror": "a mirror has no glass", "two sides": "heights are measured from a flat entrance"},
+    {"mirror": "a mirror has no glass"},
 )
 
 
 def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[str, float]:
-    """Least and largest height above the flat entrance, mm, as of `manufacture`; nothing of a mirror or a free-form entrance."""
+    """Least wall and height of a blank, mm, as of `manufacture`; nothing of a mirror."""
     if not WALL.supports(scene):
         return {}
     (z,) = sampled(field, heights, [_points(s) for s in field.spaces], ((0, 0),))
-    z = z[_within(scene.lens.opening, z)]
-    return {"minimum_wall_mm": float(z.min()) - scene.lens.z_in, "stock_height_mm": float(z.max()) - scene.lens.z_in}
+    inside, below = _within(scene.lens.opening, z), _below(scene.lens, field)
+    z, below = z[inside], below[inside]
+    return {"minimum_wall_mm": float((z - below).min()), "stock_height_mm": float(z.max() - below.min())}
 
 
 def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -> str:
@@ -239,20 +270,31 @@ def write_json(path: str | Path, figures: dict) -> None:
     write_bytes(path, (json.dumps({"created_by": SOFTWARE} | figures, indent=2, allow_nan=False) + "\n").encode())
 
 
+def _slope(f: dict) -> str:
+    return f"{f['maximum_slope']:.4f} (surely below {f['maximum_slope_bound']:.4f})"
+
+
+def _concave(f: dict) -> str:
+    radius, at = f["smallest_concave_radius_mm"], f["smallest_concave_radius_at_mm"]
+    return "nowhere concave" if radius is None else f"{radius:.4g} mm at ({at[0]:.3g}, {at[1]:.3g})"
+
+
 def rows(f: dict) -> list[tuple[str, str]]:
     """The figures as rows of a table (name, text)."""
-    radius, at = f["smallest_concave_radius_mm"], f["smallest_concave_radius_at_mm"]
-    concave = "nowhere concave" if radius is None else f"{radius:.4g} mm at ({at[0]:.3g}, {at[1]:.3g})"
+    concave = _concave(f)
     if "tool_radius_mm" in f:
         concave += f"; a tool of {f['tool_radius_mm']:g} mm {'fits' if f['tool_fits'] else 'DOES NOT FIT'}"
 
     def of_a_pixel(key: str, unit: str) -> str:
         return "" if f[key] is None else f"; one pixel at {f[key]:.3g}{unit}"
 
-    found = [
-        ("maximum slope", f"{f['maximum_slope']:.4f} (surely below {f['maximum_slope_bound']:.4f})"),
-        ("smallest concave radius", concave),
-        ("sharpness limit", f"{f['sharpness_limit_mm']:.3g} {f['screen_unit']}, {f['sharpness_limit_pixels']:.3g} pixels"),
+    found = [("maximum slope", _slope(f)), ("smallest concave radius", concave)]
+    if other := f.get("entrance"):
+        found += [("maximum slope of the entrance", _slope(other)), ("smallest concave radius there", _concave(other))]
+    if f["sharpness_limit_mm"] is not None:
+        limit = f"{f['sharpness_limit_mm']:.3g} {f['screen_unit']}, {f['sharpness_limit_pixels']:.3g} pixels"
+        found.append(("sharpness limit", limit))
+    found += [
         (
             "throw wrong by 1 mm",
             f"light moves {f['landing_mm_per_mm_throw']:.3g} {f['screen_unit']}{of_a_pixel('throw_error_of_a_pixel_mm', ' mm')}",

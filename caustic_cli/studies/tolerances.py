@@ -44,7 +44,7 @@ from caustic_cli.io.files import CREATED_BY, SOFTWARE, atomic_file, write_bytes
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.form_error import FormErrors, refined
+from caustic_cli.optics.form_error import FormErrors, OtherSurfaces, refined
 from caustic_cli.optics.misalignment import LandingPoints, Misalignment, landing_points, reason_ignored
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SOBOL_RAYS, stream
@@ -118,7 +118,9 @@ class Trials:
         self.target = target if target.ndim == 3 else target[None]
         self.rays = max(2, rays // self.divisor)
         self.parameters = tuple(p for p in tolerances.parameters if not reason_ignored(scene, p.error))
-        self.surfaces = FormErrors(self.field, tolerances.form, tolerances.waviness) if tolerances.surface else None
+        statistics = tolerances.form, tolerances.waviness
+        self.surfaces = FormErrors(self.field, *statistics) if tolerances.surface else None
+        self.others = OtherSurfaces(scene, *statistics, tolerances.shortest) if tolerances.surface else None
         self.gain: tuple[float, float] | None = None
 
     def evaluate(self, values: Values, number: int | None = None, which: tuple[str, ...] | None = None) -> TrialFigures:
@@ -140,8 +142,8 @@ class Trials:
 
     def _pair(self, errors: Misalignment, number: int | None, which: tuple[str, ...]) -> list[np.ndarray]:
         """The images without roughness; number: of the realisation of the surface errors `which`, None for none."""
-        heights = self.heights if number is None else self.heights + self.surface(number, which)
-        return [self._image(self._rays(errors, heights, half)) for half in (0, 1)]
+        scene, heights = self.shaped(number, which)
+        return [self._image(self._rays(errors, heights, half, scene)) for half in (0, 1)]
 
     def nominal(self) -> TrialFigures:
         """Figures without errors, with NOMINAL times as many rays."""
@@ -174,16 +176,20 @@ class Trials:
             error, min(error, shifted), (shift[0], shift[1]), float(together[self.target > 0].sum()), float(together.sum()), noise
         )
 
-    def surface(self, number: int, which: tuple[str, ...]) -> Tensor:
-        """A realisation of these surface errors as control heights (n, m) mm."""
-        assert self.surfaces is not None
-        return self.surfaces.heights(np.random.default_rng([self.tolerances.seed, 1, number]), which)
+    def shaped(self, number: int | None, which: tuple[str, ...]) -> tuple[Scene, Tensor]:
+        """The scene, and control heights (n, m) mm of the exit, with a realisation of these surface errors, None for none."""
+        if number is None or not which or self.surfaces is None or self.others is None:
+            return self.scene, self.heights
+        rng = np.random.default_rng([self.tolerances.seed, 1, number])
+        heights = self.heights + self.surfaces.heights(rng, which)
+        return self.others.realised(rng, which), heights
 
-    def _rays(self, errors: Misalignment, heights: Tensor, half: int) -> list[LandingPoints]:
-        changed, even = errors.scene(self.scene), self.scene.source.parallel or self.rays > SOBOL_RAYS // 4
+    def _rays(self, errors: Misalignment, heights: Tensor, half: int, scene: Scene | None = None) -> list[LandingPoints]:
+        scene = scene or self.scene
+        changed, even = errors.scene(scene), self.scene.source.parallel or self.rays > SOBOL_RAYS // 4
         kind, seed = "stratified" if even else "sobol", stream(self.tolerances.seed, f"tolerances {half}")
         rays = rays_of(changed.batch(half % 2, 2), kind, self.rays, seed)
-        return list(landing_points(self.scene, self.field, heights, rays, errors, self.requests))
+        return list(landing_points(scene, self.field, heights, rays, errors, self.requests))
 
     def _image(self, parts: Iterable[LandingPoints]) -> np.ndarray:
         image = np.zeros(self.target.shape)

@@ -78,11 +78,11 @@ class WaveTrials(Trials):
         """
         kept = {key: v for key, v in values.items() if key[0] in WAVED}
         errors, which = Misalignment.of(kept), self.tolerances.surface if number is not None else ()
-        scene = errors.scene(self.scene)
+        shaped, heights = self.shaped(None if number is None else number % REALISED, which)
+        scene = errors.scene(shaped)
         screen, (x, y, z) = scene.screen, errors.away(scene)
         scene = replace(scene, screen=replace(screen, z=screen.z + z, shift=(screen.shift[0] + x, screen.shift[1] + y)))
-        surface = self.surface(number % REALISED, which) if which and number is not None else 0.0
-        own = self._coloured(self.waves(scene, self.field, self.heights + errors.thickness + surface))
+        own = self._coloured(self.waves(scene, self.field, heights + errors.thickness))
         return self.evaluate(kept, number), self.figures_of(own, own)
 
     def _coloured(self, image: np.ndarray) -> np.ndarray:
@@ -91,8 +91,8 @@ class WaveTrials(Trials):
     def _wave_image(self, number: int, which: tuple[str, ...]) -> list[np.ndarray]:
         """Cubic spline coefficients of the wave image of a realisation of the surface errors, per colour."""
         if (number, which) not in self.smooth:
-            heights = self.heights + self.surface(number, which) if which else self.heights
-            found = self._coloured(self.waves(self.scene, self.field, heights))
+            scene, heights = self.shaped(number, which)
+            found = self._coloured(self.waves(scene, self.field, heights))
             self.smooth[number, which] = [spline_filter(c, order=3) for c in found]
         return self.smooth[number, which]
 

@@ -10,7 +10,6 @@ from caustic_cli.scene.traits import TRAITS, Capability
 #: Where they stand; of a mapping or a list, those of all entries.
 PLACES = (
     "scene.elements:BESIDE_ELEMENTS",
-    "scene.elements:BESIDE_LENSES",
     "optics.waves.unsupported:WAVE_IMAGE",
     "optics.waves.unsupported:WAVE_REFINEMENT",
     "optics.waves.unsupported:WAVES_BY_DEFAULT",

@@ -156,6 +156,7 @@ class EffectStudy(StudyKind):
     """Effects on and off; by default of the initial sphere of a design."""
 
     name, home, unit, takes, rays_of_all = "effects", "effects", "effects", ("repeats", "dtype"), True
+    unsupported: Mapping[str, str] = {}
 
     def run(self, asked: StudyRequest) -> Study:
         from caustic_cli.workflow.compilation import compile_for  # noqa: PLC0415

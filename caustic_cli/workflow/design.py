@@ -37,7 +37,7 @@ from caustic_cli.kinds.evaluation import Evaluated
 from caustic_cli.kinds.surface import PLATE, WALL
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import split_heights
+from caustic_cli.optics.system import split_heights, trace_arguments
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.completion import complete, shape_words
@@ -504,7 +504,8 @@ def _run(
             state.heights = rounded(designer.within_limits(state))
         with say.waiting("evaluation with independent rays", evaluation_seconds(designer, state)):
             evaluated = evaluate_and_write(project, designer, state, timed)
-        made = manufacture.wall_and_stock(problem.scene, designer.field(evaluated.state.stage), designer.exit(evaluated.state))
+        field = designer.field(evaluated.state.stage)
+        made = manufacture.wall_and_stock(*trace_arguments(problem.scene, field, evaluated.state.heights))
         result = _finished(project, designer, evaluated, made, began, records)
         result = replace(result, figures=result.figures | movie.finish(evaluated.shown, evaluated.figures, say))
         if asked:

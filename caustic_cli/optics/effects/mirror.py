@@ -22,8 +22,8 @@ class Mirror(Effect):
         return Decision(self.name, False, "the surface is glass", fixed=True, present=False)
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
-        """The same surface as a mirror, with the screen where it is seen in it; None for a gradient-index lens."""
-        if scene.lens.gradient is not None:
+        """The same surface as a mirror, with the screen where it is seen in it; None for a gradient-index lens, or among others."""
+        if scene.lens.gradient is not None or scene.elements:
             return None
         z, tilt = 2.0 * float(heights.mean()) - scene.screen.z, scene.screen.tilt
         tilt = (-tilt[0], -tilt[1], *tilt[2:])  # seen in it, the normal points the other way, too

@@ -6,6 +6,7 @@ refracts, transfers to the screen and splats.  Everything is float64, whatever t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -151,7 +152,8 @@ class RayKernel:
 
     Args:
         spaces, half_size: of the height field; half widths in mm.
-        origin, direction, power: of the rays below the surface; z of all origins is one number, mm.
+        origin, direction, power: of the rays below the surface, whose lines may start outside the aperture; z of all origins is
+            one number, mm.
         radius: of a circular aperture, mm, or None.
         like: the kernel of another bundle through the same field, whose workspace serves both.
     """
@@ -168,16 +170,37 @@ class RayKernel:
         x, y, *direction = (t.double()[order] for t in (*origin[:2], *direction))
         power = power.double()[order]
         power[count:] = 0.0
-        self.hits, self.z = RayIntersections(self.surface, (x, y, origin[2]), direction, radius), origin[2]
+        #: Distances from the origins to where rays enter the aperture, (N,) mm; None where all start inside.
+        self.way = _way_inside(half_size, (x, y), direction)
+        start = x, y, origin[2]
+        if self.way is not None:
+            start = tuple(o + self.way * d for o, d in zip(start, direction, strict=True))
+        self.hits, self.z = RayIntersections(self.surface, start, direction, radius), origin[2]
         self.rays = RowsOfRays(*(_strided(t.view(self.shape).numpy()) for t in (x, y, *direction[:2], power)))
         ones = np.ones((self.shape[0], 1))
         self.rows = (np.arange(self.shape[0]), ones, ones)
 
     def __call__(self, heights: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
         """Control heights (n, m) mm float64; `reference` is where the screen's height is counted from, mm: see `_splat`."""
-        nets = [t.view(self.shape) for t in self.hits(heights)]
+        reach, *slopes = self.hits(heights)
+        if self.way is not None:
+            reach = torch.where(reach >= 0.0, reach + self.way, reach)
+        nets = [t.view(self.shape) for t in (reach, *slopes)]
         heights_of = self.z - reference, screen.z - reference
         return _splat(nets, self.rows, True, self.rays, (eta, fresnel), heights_of, screen, filter, self.workspace)
+
+
+def _way_inside(half_size: tuple[float, float], origin: tuple[Tensor, Tensor], direction: list[Tensor]) -> Tensor | None:
+    """Distances along rays from origins outside a rectangle to where they enter it, 0 from inside and for those that never do, (N,)
+    mm; None where all start inside."""
+    way, last = torch.zeros_like(origin[0]), torch.full_like(origin[0], math.inf)
+    for o, d, r in zip(origin, direction, half_size, strict=False):
+        one, other = ((side * r - o) / d for side in (-1.0, 1.0))
+        beside = d == 0.0
+        way = torch.maximum(way, torch.where(beside, 0.0, torch.minimum(one, other)))
+        last = torch.minimum(last, torch.where(beside, math.inf, torch.maximum(one, other)))
+    way = torch.where(way < last, way, 0.0)
+    return way if bool((way > 0.0).any()) else None
 
 
 class PencilKernel:

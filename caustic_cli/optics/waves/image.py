@@ -27,6 +27,7 @@ from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.spread import POINT, Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
+from caustic_cli.optics.waves.imaged_exit import ImagedExit
 from caustic_cli.optics.waves.propagation import (
     TURN,
     Exposure,
@@ -41,7 +42,7 @@ from caustic_cli.optics.waves.propagation import (
 from caustic_cli.optics.waves.sampling import Sampling, memory_free
 from caustic_cli.optics.waves.tilted import TiltedExposure, power_on_tilted
 from caustic_cli.optics.waves.unsupported import NoWaveImage, receiver_of
-from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, distance_of, survey, wavefront
+from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, survey, wavefront
 from caustic_cli.scene import Light, Scene, Screen, Source
 from caustic_cli.scene.materials import nearest_index
 
@@ -135,14 +136,14 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
         lens = replace(scene.lens, roughness=0.0)
         if (glass := lens.interior.glass) is not None:
             lens = replace(lens, index=nearest_index(glass, wavelength))
+        elements = tuple(e.at(wavelength) for e in scene.elements)
+        indices = (lens.index, *(e.index for e in elements))
         for state in states:
-            if (lens.index, state) not in systems:  # light of one index and polarisation takes the same paths
-                one = replace(scene, lens=lens, light=Light(state))
-                systems[lens.index, state] = System.of(one, field)
+            if (indices, state) not in systems:  # light of the same indices and polarisation takes the same paths
+                one = replace(scene, lens=lens, elements=elements, light=Light(state))
+                systems[indices, state] = System.of(one, field)
             found.append(
-                Line(
-                    wavelength, part / len(states), systems[lens.index, state], None, channel, colour, k % 2 if continuous else None
-                )
+                Line(wavelength, part / len(states), systems[indices, state], None, channel, colour, k % 2 if continuous else None)
             )
     return found
 
@@ -280,7 +281,8 @@ class Imager:
     """Common settings of the images of a source's lines and modes: the computed region and the sampling.
 
     spread: point-spread function of a mode; each: modes per position of the source, 0 for a single mode of the whole source;
-    perturbation: additional height of the last surface at points (N,), mm: fine structure of small amplitude, which changes optical
+    imaged: see `Optics`;
+    perturbation: additional height of the exit at points (N,), mm: fine structure of small amplitude, which changes optical
     paths to first order and does not deflect rays.
     """
 
@@ -291,6 +293,7 @@ class Imager:
     spread: Spread
     nodes: tuple[int, int]
     each: int
+    imaged: ImagedExit | None = None
     exact: bool = False
     tapered: bool = True
     perturbation: Perturbation | None = None
@@ -320,8 +323,9 @@ class Imager:
         """
         ways = [group[0] for group in _alike(lines)]
         system, plane = ways[0].system, receiver.plane
-        distance = distance_of(system, parameters, plane)
-        alike = [Optics(k.system, central_mode(system), parameters, k.length, k.label, plane, distance) for k in ways]
+        alike = [Optics.of(system, central_mode(system), parameters, ways[0], plane)]
+        distance, imaged = alike[0].distance, alike[0].imaged
+        alike += [replace(alike[0], system=k.system, wavelength=k.length, label=k.label) for k in ways[1:]]
         outer = outermost_modes(system)
         surveys = [survey(replace(one, mode=mode)) for one in alike for mode in (one.mode, *outer)]
         lengths = tuple(k.behind for k in lines)
@@ -339,7 +343,7 @@ class Imager:
         nodes, enough = sampling.count, max(LEAST_NODES, A_SPAN * max(finest))
         if not dense:
             nodes = min(nodes[0], enough), min(nodes[1], enough)
-        return cls(system.source, receiver, surveys[0], sampling, spread, nodes, each, exact, watched is None)
+        return cls(system.source, receiver, surveys[0], sampling, spread, nodes, each, imaged, exact, watched is None)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
         """The wave image of these lines, at heights {name: (n, m) mm} close to those for which the sampling was chosen."""
@@ -376,7 +380,8 @@ class Imager:
 
     def optics(self, line: Line, mode: Mode, parameters: Parameters) -> Optics:
         """The wavefront computation of one mode."""
-        return Optics(line.system, mode, parameters, line.length, line.label, self.receiver.plane, self.sampling.distance)
+        plane, far = self.receiver.plane, self.sampling.distance
+        return Optics(line.system, mode, parameters, line.length, line.label, plane, far, self.imaged)
 
     def front(self, line: Line, mode: Mode, parameters: Parameters, sensitive: bool = False) -> Wavefront:
         """The wavefront of a mode behind the lens, on `nodes`."""

@@ -6,7 +6,6 @@ from caustic_cli.errors import CausticError, InputError
 from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.system import PlacedScreen, System
 from caustic_cli.scene import Screen
-from caustic_cli.scene.elements import NOT_BESIDE
 from caustic_cli.scene.traits import Capability
 
 #: Least cosine between a screen's normal and the axis: near grazing incidence off-axis light is parallel to the screen.
@@ -24,7 +23,6 @@ WAVE_IMAGE = Capability(
         "ray file": "a ray file contains no phase",
         "curved screen": "a curved screen has no wave image",
         "gradient index": "wave images are implemented for homogeneous lenses only",
-        "other elements": "wave images are implemented for a single lens only",
     },
 )
 WAVE_REFINEMENT = Capability(
@@ -35,15 +33,15 @@ WAVE_REFINEMENT = Capability(
         "curved screen": "⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine",
         "several sources": "⟨design.waves⟩ on needs one source: light of several is refined by rays alone",
         "two sides": "⟨design.waves⟩ on: two free-form sides are refined by rays alone",
-        "other elements": f"⟨design.waves⟩ on{NOT_BESIDE}",
     },
 )
 WAVES_BY_DEFAULT = Capability(
     "design by waves unless asked for",
-    {name: WAVE_IMAGE.unsupported[name] for name in ("gradient index", "other elements", "ray file")}
+    {name: WAVE_IMAGE.unsupported[name] for name in ("gradient index", "ray file")}
     | {
         "several sources": "light of several sources is refined by rays alone",
         "curved screen": WAVE_IMAGE.unsupported["curved screen"],
+        "other elements": "behind other elements it takes many samples, or a part of the light; ⟨waves⟩ on refines it all the same",
         "lenslet array": "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on"
         " refines it",
         "tilted screen": "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same",
@@ -52,7 +50,7 @@ WAVES_BY_DEFAULT = Capability(
     },
 )
 #: Of the scenes without a wave image, the limits of what is implemented, so that the effect cannot be asked for.
-NOT_IMPLEMENTED = ("gradient index", "other elements")
+NOT_IMPLEMENTED = ("gradient index",)
 
 
 def receiver_of(system: System, screen: Screen | PlacedScreen) -> Receiver:

@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,8 +42,9 @@ from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.receiver import NormalPlane, dot
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.system import System
+from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
+from caustic_cli.optics.waves.imaged_exit import ImagedExit
 from caustic_cli.optics.waves.interpolation import FineWavefront, Lit, extrapolated, interpolate, lagrange_weights
 from caustic_cli.optics.waves.ray_aiming import aimed_rays
 from caustic_cli.optics.waves.unsupported import NoWaveImage
@@ -52,6 +54,9 @@ from caustic_cli.scene.screen import passed_by
 interpolate_nd = OnDemand("scipy.interpolate")
 #: Points along each side of the pupil for a survey; fraction of rays outside the quantiles `mostly`.
 SURVEY, FEW = 65, 0.01
+#: Least number of its rays that arrive.
+LEAST_LIT = 16
+DARK = "no light reaches the screen, so it has no wave image"
 #: Tolerance of ray aiming: error of the optical path relative to the wavelength.
 LEFT = 1e-4
 #: The same for exact derivatives, whose error is of first order in the displacement.
@@ -80,8 +85,8 @@ SOFT = 0.02
 @dataclass
 class Intercepts:
     """Rays by their intercepts, (N,) each: x, y, path v, direction cosines qx, qy, landing points X, Y, and power, a density on the
-    pupil; see the module.  On request at_x, at_y, mm, the points of the last surface, and sensitivity, the derivative of the path
-    by its height."""
+    pupil; see the module.  On request at_x, at_y, mm, the points of the exit or last surface, and sensitivity, the derivative
+    of the path by its height."""
 
     x: Tensor
     y: Tensor
@@ -111,8 +116,7 @@ class Optics:
     """The trace of one mode of a source for its wavefront.
 
     wavelength: mm; label: nm, at which the indices of media are evaluated, None if the system has them already; plane: of the
-    screen;
-    distance: L, mm.
+    screen; distance: L, mm; imaged: with other elements behind the lens' exit, what is then the reference plane.
     """
 
     system: System
@@ -122,22 +126,41 @@ class Optics:
     label: float | None
     plane: NormalPlane
     distance: float
+    imaged: ImagedExit | None = None
+
+    @classmethod
+    def of(cls, system: System, mode: Mode, parameters: Parameters, line: Any, plane: NormalPlane) -> Optics:
+        """Of a spectral line (`image.Line`), with the distance of the plane from the last surface, or of its image behind the
+        exit."""
+        self = cls(system, mode, parameters, line.length, line.label, plane, distance_of(system, parameters, plane))
+        if EXIT not in [e.name for e in system.elements[:-1]]:
+            return self
+        with torch.no_grad():
+            left, last = self.interactions(*_grid(device_of(self)))
+            f = self.intercepts_of(last)
+            lit = f.power > 0
+            if int(lit.sum()) < LEAST_LIT:
+                raise NoWaveImage(DARK)
+            at = tuple(c.expand(lit.shape)[lit] for c in left.hit.local[:2])
+            imaged = ImagedExit.fitted(at, (f.big_x[lit], f.big_y[lit]), (f.qx[lit], f.qy[lit]), self.distance)
+        return replace(self, distance=imaged.distance, imaged=imaged)
 
     @property
     def index(self) -> float:
         """Refractive index of the image space."""
         return self.system.media()[-1].index_at(self.label)
 
-    def interactions(self, u: Tensor, v: Tensor) -> Interaction:
-        """Rays through points (N,) of the pupil at the last element, behind the interaction."""
+    def interactions(self, u: Tensor, v: Tensor) -> tuple[Interaction, Interaction]:
+        """Rays through points (N,) of the pupil at the lens' exit, or where there is none at the last element, and at that; behind
+        the interaction."""
         rays = self.mode.through(u, v, self.system.object_space.index_at(self.label))
-        return Tracer(self.system, rays, requests=STAGES, wavelength=self.label).last(self.parameters)
+        return Tracer(self.system, rays, requests=STAGES, wavelength=self.label).ends(self.parameters)
 
     def intercepts(self, u: Tensor, v: Tensor, sensitive: bool = False) -> Intercepts:
         """Intercepts of the rays through points (N,) of the pupil; sensitive: with those at the last surface."""
         if torch.is_grad_enabled() or len(u) <= CHUNK:
-            met = self.interactions(u, v)
-            return _with_last(met, self.intercepts_of(met)) if sensitive else self.intercepts_of(met)
+            met, last = self.interactions(u, v)
+            return _with_exit(met, self.intercepts_of(last)) if sensitive else self.intercepts_of(last)
         found: Intercepts | None = None
         for start in range(0, len(u), CHUNK):
             part = slice(start, start + CHUNK)
@@ -148,9 +171,9 @@ class Optics:
         return found
 
     def landing(self, mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Landing points X, Y of another mode's light, mm, its power, and its points on the last element, mm."""
-        met = replace(self, mode=mode).interactions(u, v)
-        f, state = self.intercepts_of(met), met.state.expanded()
+        """Landing points X, Y of another mode's light, mm, its power, and its points on the exit or last element, mm."""
+        met, last = replace(self, mode=mode).interactions(u, v)
+        f, state = self.intercepts_of(last), met.state.expanded()
         x, y = (c.expand(len(u)) if isinstance(c, Tensor) else torch.full_like(u, c) for c in state.origin[:2])
         return f.big_x, f.big_y, f.power, x, y
 
@@ -174,8 +197,13 @@ class Optics:
         t = torch.where(ahead, t, torch.zeros_like(t))
         big_x, big_y = (sum(a * b for a, b in zip(o, e, strict=True)) + t * q for e, q in ((e1, qx), (e2, qy)))
         n, far = self.index, self.distance
-        path = state.path + n * t - n * far * (1.0 + 0.5 * (qx * qx + qy * qy))
         power = torch.where(ahead, state.power, torch.zeros_like(state.power))
+        path = state.path + n * t
+        if self.imaged is not None:
+            (x, qx), (y, qy) = self.imaged.intercept(0, big_x, qx), self.imaged.intercept(1, big_y, qy)
+            path = path - n * (self.imaged.path(0, big_x) + self.imaged.path(1, big_y) + 0.5 * far * (qx * qx + qy * qy))
+            return Intercepts(x, y, path, qx, qy, big_x, big_y, power)
+        path = path - n * far * (1.0 + 0.5 * (qx * qx + qy * qy))
         return Intercepts(big_x - far * qx, big_y - far * qy, path, qx, qy, big_x, big_y, power)
 
 
@@ -242,14 +270,13 @@ def survey(optics: Optics) -> Survey:
     Raises:
         NoWaveImage: no light reaches the screen.
     """
-    line = torch.linspace(0.0, 1.0, SURVEY, dtype=torch.float64, device=device_of(optics))
-    u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
+    u, v = _grid(device_of(optics))
     f = optics.intercepts(u, v)
     lit = f.power > 0
     pupil = optics.mode.scene.pupil
     lit &= pupil.aperture.covers(2.0 * u - 1.0, 2.0 * v - 1.0, 1e-12)
-    if int(lit.sum()) < 16:
-        raise NoWaveImage("no light reaches the screen, so it has no wave image")
+    if int(lit.sum()) < LEAST_LIT:
+        raise NoWaveImage(DARK)
     light, landing = (
         tuple(tuple(float(getattr(c[lit], w)()) for c in pair) for w in ("min", "max")) for pair in ((f.x, f.y), (f.big_x, f.big_y))
     )
@@ -284,6 +311,13 @@ def survey(optics: Optics) -> Survey:
     uneven = reshapes and any(float((g / s - 1.0).abs().max()) > UNEVEN for g, s in zip(stretched, scale, strict=True))
     places = tuple(c[lit] for c in (u, v, f.x, f.y)) if uneven else None
     return Survey(light, landing, (offset[0], offset[1]), (scale[0], scale[1]), magnification, mostly, (skew[0], skew[1]), places)
+
+
+def _grid(device: torch.device) -> tuple[Tensor, Tensor]:
+    """u and v of the rays of a survey."""
+    line = torch.linspace(0.0, 1.0, SURVEY, dtype=torch.float64, device=device)
+    u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
+    return u, v
 
 
 def _centred(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -466,8 +500,8 @@ def _density(
     return density, Lit(edge_x, edge_y, (~dark).double() if bool(dark.any()) else None)
 
 
-def _with_last(m: Interaction, f: Intercepts) -> Intercepts:
-    """Intercepts of rays behind the last element, with those at its surface."""
+def _with_exit(m: Interaction, f: Intercepts) -> Intercepts:
+    """Intercepts of rays behind the last element, with their points on the surface of the interaction."""
     into, normal = m.hit.incoming[2], m.element.pose.axes[2]
     out = sum(c * a for c, a in zip(m.state.full(m.state.direction), normal, strict=True))
     x, y = (c.expand(out.shape) for c in m.hit.local[:2])

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies import manufacture
-from caustic_cli.workflow.outputs.base import Output, Rendering, single
+from caustic_cli.workflow.outputs.base import Output, Rendering
 
 
 @dataclass(eq=False)
@@ -15,7 +15,9 @@ class ManufacturingReport(Output):
     """The figures; tool_radius: of a tool that is to fit in concave regions, mm."""
 
     option: ClassVar[str] = "report"
-    capability: ClassVar[Capability] = single("manufacturing report", "report")
+    capability: ClassVar[Capability] = Capability(
+        "manufacturing report", {"gradient index": "⟨report⟩ supports lenses of uniform index, and this one has {}"}
+    )
     files: ClassVar[tuple[str, ...]] = ("report.json",)
     beyond: ClassVar[bool] = True
 

@@ -21,7 +21,7 @@ from caustic_cli.studies import tolerances as study
 from caustic_cli.studies.irradiance import source_figures
 from caustic_cli.studies.tolerances_by_waves import WaveTrials
 from caustic_cli.workflow.lens import Lens
-from caustic_cli.workflow.outputs.base import Output, Rendering, single
+from caustic_cli.workflow.outputs.base import Output, Rendering
 
 
 @dataclass(eq=False)
@@ -32,7 +32,9 @@ class ToleranceAnalysis(Output):
     """
 
     option: ClassVar[str] = "tolerances"
-    capability: ClassVar[Capability] = single("tolerance analysis", "tolerances")
+    capability: ClassVar[Capability] = Capability(
+        "tolerance analysis", {"gradient index": "⟨tolerances⟩ supports lenses of uniform index, and this one has {}"}
+    )
     files: ClassVar[tuple[str, ...]] = ("tolerances.csv", "tolerances.png")
     beyond: ClassVar[bool] = True
 
