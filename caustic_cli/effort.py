@@ -168,7 +168,7 @@ STANDARD = Effort(
 FINE = Effort(
     seconds=60.0,
     coarse_to_fine=(40, 120),
-    refinement=Refinement(2.0, 957, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25)), large=LargePictures(700)),
+    refinement=Refinement(2.0, 957, 256, 16_000_000, 8, ((0.25, 16), (1.0, 16)), large=LargePictures(700)),
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 64, 4_000_000, 4, ((1.0, 200),)),
     waves=((5, 12), (6, 12), (8, 40)),
