@@ -150,7 +150,7 @@ class Effort:
 DRAFT = Effort(
     seconds=0.0,
     coarse_to_fine=(15, 25),
-    refinement=Refinement(1.0, 256, 16, 1_000_000, 2, ((1.0, 14),), large=LargePictures(256)),
+    refinement=Refinement(1.0, 256, 16, 1_000_000, 3, ((1.0, 8),), large=LargePictures(256)),
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
     system=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
     exit_alone=None,
@@ -161,8 +161,8 @@ STANDARD = Effort(
     seconds=8.0,
     coarse_to_fine=(25, 50),
     refinement=Refinement(
-        *(2.0, 957, 64, 8_000_000, 4, ((0.5, 8), (1.0, 24))),
-        large=LargePictures(700, rays_per_pixel=8, most_rays=16_000_000, plan=((1.0, 24),)),
+        *(2.0, 957, 64, 8_000_000, 6, ((0.5, 6), (1.0, 10))),
+        large=LargePictures(700, rays_per_pixel=8, most_rays=16_000_000, plan=((1.0, 8),)),
     ),
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 48, 3_000_000, 4, ((1.0, 50),)),
@@ -173,7 +173,7 @@ STANDARD = Effort(
 FINE = Effort(
     seconds=60.0,
     coarse_to_fine=(40, 120),
-    refinement=Refinement(2.0, 957, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25)), large=LargePictures(700)),
+    refinement=Refinement(2.0, 957, 256, 16_000_000, 8, ((0.25, 16), (1.0, 16)), large=LargePictures(700)),
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 64, 4_000_000, 4, ((1.0, 200),)),
     exit_alone=Refinement(6.0, 1152, 64, 4_000_000, 8, ((1.0, 60),), 96),

@@ -50,6 +50,34 @@ def spread(half: float, cut: int = 1, pixel: float = 0.1) -> Convolution:
 # The best light behind a blur
 
 
+@pytest.mark.parametrize(("half", "cut"), [(0.03, 4), (0.13, 2), (0.32, 1), (0.2, 3)])
+def test_the_blur_of_even_pixels_is_that_of_their_cells(half, cut):
+    kernel = Spread((half, 1.3 * half), ((-0.02, 0.0, 0.25), (0.01, 0.03, 0.75)), 0.0).on((0.1, 0.12), cut)
+    whole = kernel.of_even_pixels
+    light = torch.rand(20, 23, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    cells = light.repeat_interleave(kernel.cut, 0).repeat_interleave(kernel.cut, 1) / kernel.cut**2
+    seen, expected = (
+        blur(torch.nn.functional.pad(image, (blur.beside[1],) * 2 + (blur.beside[0],) * 2))
+        for blur, image in ((whole, light), (kernel, cells))
+    )
+    torch.testing.assert_close(seen, expected, rtol=0.0, atol=1e-14)
+
+
+def test_the_light_behind_a_blur_of_a_pixel_is_sharper_than_the_picture():
+    """As light that is even over pixels, which is what a transport map gives; points within them would not be blurred at all."""
+    scene = Scene(Disc(position=(0.0, 0.0, -500.0), size=(1.0, 1.0)), Lens((50.0, 50.0)), Screen((100.0, 100.0), 300.0, (80, 80)))
+    picture = np.random.default_rng(5).uniform(0.5, 1.5, (80, 80))
+    blur = Spread((0.4, 0.4), ((0.0, 0.0, 1.0),), 0.0)
+    light, fine = source_limits.best_irradiance(scene, picture, blur, 60).light, blur.on(scene.screen.pixel)
+
+    def error(light: np.ndarray) -> float:
+        a, b = (n // fine.cut - (len(light) - 80) // 2 for n in fine.beside)
+        cells = np.pad(light, ((a, a), (b, b))).repeat(fine.cut, 0).repeat(fine.cut, 1)
+        return relative_rms(fine(torch.from_numpy(cells)).numpy(), picture)
+
+    assert error(light) < 0.3 * error(picture)
+
+
 @pytest.mark.parametrize("cut", [1, 2])
 @pytest.mark.parametrize("half", [0.15, 0.5])
 def test_no_light_comes_closer_than_the_bound(half, cut):

@@ -323,3 +323,8 @@ def test_cells_of_the_start_follow_rays_or_a_fine_net():
     assert transport_cells(4_000_000, False, 500) == 500
     assert transport_cells(4_000_000, False, 2000) == 2000
     assert transport_cells(1_000_000, True, 2000) == 500  # each cell of a near source's light is solved for
+
+
+def test_after_a_transport_start_heights_are_refined_without_a_preconditioner():
+    exact, coarse = (complete({"design": {"start": start}}, 1.0).design for start in ("transport", "offset"))
+    assert (exact.preconditioner, coarse.preconditioner) == ("none", "laplacian")

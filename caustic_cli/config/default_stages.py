@@ -193,7 +193,7 @@ def refinement(
     if large := how.large_at(max(resolution)):
         most, plan = max(most, min(large.rays_per_pixel * pixels, large.most_rays)), large.plan or plan
     rays = rays or max(LEAST_RAYS, min(most, how.rays_per_pixel * pixels) // fewer)
-    finer = max(1, min(how.subdivision, math.isqrt(rays // pixels)))
+    finer = max(1, min(how.subdivision, round(math.sqrt(rays / pixels))))
     apron = 0 if spread else math.ceil(0.04 * max(resolution))
     stages = []
     for part, iterations in plan:

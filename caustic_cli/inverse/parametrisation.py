@@ -2,10 +2,9 @@
 
     heights = low + (1 + tanh(raw)) / 2 (high - low)                          eqs. 5.1.1, 5.1.2; low, high per control point
 
-    none      raw = parameters themselves, or with the Laplacian preconditioner
-              raw = start + C_u^T (s o y) C_v, y the parameters, C orthonormal cosine transforms (DCT-II) and
-              s_kl = 1 / (lambda_k + lambda_l), lambda_k = 4 sin^2(pi k / 2n), the inverse Laplacian of the control net;
-              or raw = start + y, counted from the start
+    none      raw = start + y, y the parameters, or with the Laplacian preconditioner
+              raw = start + C_u^T (s o y) C_v, C orthonormal cosine transforms (DCT-II) and
+              s_kl = 1 / (lambda_k + lambda_l), lambda_k = 4 sin^2(pi k / 2n), the inverse Laplacian of the control net
     sparse    1 -> a tanh layer of control-net size -> a locally connected layer, kernel (2p + 1) x (2q + 1), own weights
     dense     1 -> hidden layers, fully connected -> a fully connected layer of control-net size; in the thesis two hidden layers
               of control-net size and tanh, which eq. 5.1.1 makes three
@@ -14,7 +13,8 @@ A network may have further inputs c beside the 1, with weights of their own in t
 (`scene_parameters`).  With the Laplacian preconditioner its outputs are the coordinates y above, not raw values.
 
 The caustic depends on the Laplacian of the surface: in the preconditioned coordinates all length scales of the picture contribute
-equally to the gradient, and L-BFGS needs tens of iterations where gradient descent needs thousands.
+equally to the gradient, and L-BFGS needs tens of iterations where gradient descent needs thousands.  After a start by transport
+the large scales are right, and what is left are details of a few pixels: these converge several times as fast without it.
 """
 
 from __future__ import annotations
@@ -182,27 +182,23 @@ class Heights(torch.nn.Module):
 
 
 class FreeHeights(Heights):
-    """Free control heights; with `laplacian`, in coordinates where the response of the caustic is well conditioned.
+    """Free control heights, relative to initial ones; with `laplacian`, in coordinates where the response of the caustic at all
+    scales is well conditioned.
 
     Args:
         start: (n, m) initial heights, mm, or None for the middle of the range.
-        counted: parameters are relative to the initial heights, which `initial_heights` returns.
     """
 
-    def __init__(self, low: Tensor, high: Tensor, start: Tensor | None = None, laplacian: bool = False, counted: bool = False):
+    def __init__(self, low: Tensor, high: Tensor, start: Tensor | None = None, laplacian: bool = False):
         super().__init__(low, high)
-        self.laplacian, counted = InverseLaplacian(low) if laplacian else None, counted or laplacian
-        raw = torch.zeros_like(low) if start is None else self.invert(start)
-        self.register_buffer("start", raw if counted else None)
-        self.y = torch.nn.Parameter(torch.zeros_like(raw) if counted else raw.clone())
+        self.laplacian = InverseLaplacian(low) if laplacian else None
+        self.register_buffer("start", torch.zeros_like(low) if start is None else self.invert(start))
+        self.y = torch.nn.Parameter(torch.zeros_like(low))
 
     def raw(self, inputs: Tensor | None = None) -> Tensor:
-        y = self.y if self.laplacian is None else self.laplacian(self.y)
-        return y if self.start is None else self.start + y
+        return self.start + (self.y if self.laplacian is None else self.laplacian(self.y))
 
     def initial_heights(self) -> Tensor:
-        if self.start is None:
-            return super().initial_heights()
         return self.low + 0.5 * (1.0 + torch.tanh(self.start.double())) * self.span
 
 
@@ -217,7 +213,7 @@ class SidesTogether(FreeHeights):
     """
 
     def __init__(self, low: Tensor, high: Tensor, start: Tensor, laplacian: bool, origins: Tensor | None):
-        super().__init__(low, high, start, laplacian, counted=True)
+        super().__init__(low, high, start, laplacian)
         self.register_buffer("origins", low.new_zeros(*low.shape[1:], 2) if origins is None else origins)
 
     def raw(self, inputs: Tensor | None = None) -> Tensor:
@@ -329,8 +325,6 @@ def parametrise(
             noise = torch.rand(low.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
             module = FreeHeights(low, high, None, False)
             module.y.data = ((2.0 * noise - 1.0) * spread).to(low)
-            if preconditioner == "none":
-                return module
             start = module().detach()
         return FreeHeights(low, high, start, preconditioner == "laplacian")
     if start is not None and preconditioner == "none":

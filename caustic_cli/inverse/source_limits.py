@@ -111,8 +111,9 @@ def _least_error(target: np.ndarray, images: list[Spread], pixel: tuple[float, f
 
 
 def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int) -> Deconvolved:
-    """The deconvolution of a target by the source's blur on the screen of a scene; see `deconvolved`."""
-    return deconvolved(target, spread.on(scene.screen.pixel, FINEST), steps)
+    """The deconvolution of a target by the source's blur on the screen of a scene, see `deconvolved`, to light that is even over
+    each pixel, as a transport map makes it."""
+    return deconvolved(target, spread.on(scene.screen.pixel).of_even_pixels, steps)
 
 
 def source_spread(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:

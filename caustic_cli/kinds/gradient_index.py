@@ -25,7 +25,7 @@ from caustic_cli.schema.table import LensSettings, ScreenSettings, check, check_
 
 #: Half range about the index; degree of its splines, knot spans per pixel and their largest number.
 HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS = 0.05, 3, 2, 768
-RAYS_BENT = 16  # largest number of rays per pixel, since they cost more
+RAYS_BENT, ITERATIONS = 16, 24  # largest number of rays per pixel, since they cost more; and iterations
 
 
 class IndexPlate(OneSurface):
@@ -68,7 +68,8 @@ class IndexPlate(OneSurface):
         d.fill_design(preconditioner="laplacian")
         if "stages" not in design:
             last = refinement(lens.control, d.rays, d.resolution, d.effort.refinement)[-1]
-            d.set_stages([last | {"rays": d.rays or min(last["rays"], RAYS_BENT * math.prod(d.resolution))}])
+            rays = d.rays or min(last["rays"], RAYS_BENT * math.prod(d.resolution))
+            d.set_stages([last | {"rays": rays, "oversample": min(4, last["oversample"]), "iterations": ITERATIONS}])
 
     def iterate(
         self,

@@ -162,7 +162,7 @@ class OneSurface(Problem):
         d.fill_design(start=cls.default_start(d))
         cls.refuse_settings(d)
         cls.complete_control(d)
-        d.fill_design(preconditioner="laplacian" if d.plain else "none")
+        d.fill_design(preconditioner="laplacian" if d.plain and not cls.exact_start(d) else "none")
         if d.complete_given_stages():
             if asked != "auto" and any(stage.waves for stage in d.design.stages) != (asked == "on"):
                 raise InputError(
@@ -292,7 +292,7 @@ class OneSurface(Problem):
 
     def parametrised(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
         if self.stages[k].waves:
-            return FreeHeights(*self.bounds(k), start, counted=True)
+            return FreeHeights(*self.bounds(k), start)
         return super().parametrised(k, start, loaded)
 
     def carries_parameters(self, k: int) -> bool:
@@ -404,18 +404,19 @@ class OneSurface(Problem):
             slope = BeamProjection(screen, vertex, lens.interaction.side, source.axis).lean(index)
         return torch.from_numpy(lens.offset.heights(x, y) + slope[0] * x[:, None] + slope[1] * y[None, :])
 
-    def transport(self, fixed: bool, seconds: float) -> InitialSurface:
+    def transport(self, fixed: bool, seconds: float, rough: bool = False) -> InitialSurface:
         """Initial heights by transport on the control net of the first stage.
 
         fixed: the thickness is given by the user; a surface below the least thickness is raised, which leaves slopes unchanged.
-        seconds: approximate time allowed for a near source.
+        seconds: approximate time allowed for a near source; rough: by the fewest cells.
 
         Raises:
             InputError: the picture cannot be reached.
         """
         scene, goal, first = self.scene, grey(self.target.numpy()), self.stages[0]
         spans = min(n - p for n, p in zip(first.control, scene.lens.degree, strict=True))
-        cells = transport_cells(max(s.rays for s in self.stages), not scene.source.parallel, spans, self.effort.source_cells)
+        rays, least = 0 if rough else max(s.rays for s in self.stages), self.effort.source_cells
+        cells = transport_cells(rays, not scene.source.parallel, 0 if rough else spans, least)
         spread = source_spread(scene) if first.spread else None
         if spread is not None:
             light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)

@@ -122,7 +122,7 @@ class TwoSides(SeveralSurfaces):
     def refuse_unreachable(self) -> None:
         """Its own initial surfaces say what they cannot reach."""
 
-    def transport(self, fixed: bool, seconds: float) -> InitialSurface:
+    def transport(self, fixed: bool, seconds: float, rough: bool = False) -> InitialSurface:
         target = None if self.second_target is None else self.second_target.numpy()
         return InitialSurface(first_sides(self.scene, grey(self.target.numpy()), target, self.field(0)))
 

@@ -211,6 +211,16 @@ class Convolution:
         a, b = (self.cut * math.ceil((n // 2) / self.cut) for n in self.kernel.shape)
         return a, b
 
+    @property
+    def of_even_pixels(self) -> Convolution:
+        """The same for light that is even over each pixel, whose cells are whole pixels."""
+        n, m = self.kernel.shape
+        (a, b), more = self.beside, self.cut - 1  # all that light of a pixel reaches
+        wide = torch.nn.functional.pad(self.kernel, (b - m // 2 + more,) * 2 + (a - n // 2 + more,) * 2)
+        pairs = 1.0 - torch.arange(-more, self.cut).abs().to(wide) / self.cut  # of cells, by their distance
+        found = torch.nn.functional.conv2d(wide[None, None], torch.outer(pairs, pairs)[None, None], stride=self.cut)
+        return Convolution(found[0, 0], 1)
+
     def __call__(self, image: Tensor) -> Tensor:
         """An image on cells, with those around the screen, (a, b) -> the convolved image on the screen's pixels; differentiable."""
         (n, m), (a, b) = image.shape, self.beside

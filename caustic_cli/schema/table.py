@@ -559,8 +559,9 @@ class DesignSettings(Section):
             " network, which is zero, so that it starts at the initial surface)",
             choices=("zero", "uniform", "random", "zero-last"), default="zero", derived="zero; zero-last of a preconditioned"
             " network")
-    preconditioner: str = setting("none or laplacian", choices=("none", "laplacian"), derived="laplacian for heights with lbfgs,"
-            " and for a network trained over a range", option=Option("--preconditioner", "none|laplacian"))
+    preconditioner: str = setting("none or laplacian", choices=("none", "laplacian"), derived="laplacian for heights with lbfgs"
+            " without an exact transport start, and for a network trained over a range",
+            option=Option("--preconditioner", "none|laplacian"))
     filter_target: bool = setting("filter the target like the render", default=True, why="otherwise the blur of the filter counts"
             " as an error")
     waves: str = setting("refine the wave image: auto (where diffraction matters and time allows), on or off",

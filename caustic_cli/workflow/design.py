@@ -149,15 +149,18 @@ def first_heights(project: Project, said: Given, problem: OneSurface) -> Prepare
         InputError: as of `prepare`.
     """
     fixed = "thickness" in said.get("lens", {})
-    first, middle = _solved(project, problem, fixed)
+    plate = problem.adapts and not fixed and _is_plate(project.settings.lens)
+    first, middle = _solved(project, problem, fixed, rough=plate)  # of a plate the surface is solved again, for its thickness
     if not problem.adapts:
         return PreparedDesign(project, problem, Designer(problem).initial_heights(first))
+    if plate and first is not None:
+        thickness = project.settings.lens.thickness if middle is None else middle
+        if (spare := _spare(project.settings.lens, said, first)) > 0:
+            project, problem = _with_lens(project, problem, thickness=thickness - spare)
+        first, middle = _solved(project, problem, fixed=spare > 0)
+        middle = thickness - spare if spare > 0 else middle
     if middle is not None:
         project, problem = _with_lens(project, problem, thickness=middle)
-    if first is not None and not fixed and (spare := _spare(project.settings.lens, said, first)) > 0:
-        middle = project.settings.lens.thickness - spare
-        project, problem = _with_lens(project, problem, thickness=middle)
-        first = _solved(project, problem, fixed=True)[0]
     if first is not None and (room := _room(project.settings.lens, said, first)):
         project, problem = _with_lens(project, problem, **room)
         if middle is None:
@@ -344,12 +347,12 @@ def sphere() -> tuple[Scene, HeightField, torch.Tensor]:
     return scene, field, torch.from_numpy(scene.lens.offset.heights(x, y))
 
 
-def _solved(project: Project, problem: OneSurface, fixed: bool) -> tuple[torch.Tensor | None, float | None]:
+def _solved(project: Project, problem: OneSurface, fixed: bool, rough: bool = False) -> tuple[torch.Tensor | None, float | None]:
     """Initial heights on the control net of the first stage, by transport or from another lens, None for the offset surface as it
     is; and the thickness that belongs to them, None if unchanged.
 
     fixed: the thickness is given by the user; a transport surface below the least thickness is raised, which leaves slopes
-    unchanged.
+    unchanged; rough: by few cells, for its depth alone.
 
     Raises:
         InputError: the project or surface cannot be read, its lens has another size, or the picture cannot be reached.
@@ -358,7 +361,7 @@ def _solved(project: Project, problem: OneSurface, fixed: bool) -> tuple[torch.T
     if start == "offset":
         return problem.offset(), None
     if start == "transport":
-        surface = problem.transport(fixed, START_PART * project.settings.design.time_limit)
+        surface = problem.transport(fixed, START_PART * project.settings.design.time_limit, rough)
         return surface.heights, surface.middle
     net = problem.field(0)
     if Path(start).suffix.lower() in surfaces.SUFFIXES and not Path(start).is_dir():
@@ -376,10 +379,13 @@ def _solved(project: Project, problem: OneSurface, fixed: bool) -> tuple[torch.T
     return surfaces.onto(field, heights, net), None
 
 
+def _is_plate(lens: LensSettings) -> bool:
+    """Whether the thickness follows from the depth of the surface and a wall behind it."""
+    return not lens.mirror and max(lens.size) > PLATE
+
+
 def _spare(lens: LensSettings, said: Given, first: torch.Tensor) -> float:
-    """Excess thickness of a plate below its initial surface beyond the wall, which may be given, mm; 0 for another lens."""
-    if lens.mirror or max(lens.size) <= PLATE:
-        return 0.0
+    """Excess thickness of a plate below its initial surface beyond the wall, which may be given, mm."""
     wall = lens.min_thickness if "min_thickness" in said.get("lens", {}) else WALL
     return max(0.0, float(first.min()) - lens.z_in - wall)
 
