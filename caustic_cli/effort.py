@@ -161,7 +161,7 @@ STANDARD = Effort(
     seconds=8.0,
     coarse_to_fine=(25, 50),
     refinement=Refinement(
-        *(2.0, 957, 64, 8_000_000, 6, ((0.5, 6), (1.0, 10))),
+        *(2.0, 957, 64, 8_000_000, 6, ((0.5, 4), (1.0, 7))),
         large=LargePictures(700, rays_per_pixel=8, most_rays=16_000_000, plan=((1.0, 8),)),
     ),
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),

@@ -324,7 +324,7 @@ def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeyp
     design(capfd, "blob.png", "--resolution", "24", "--waves", "off", "--quiet", "--threads", "1", "--time-limit", limit, "-o", "p")
     stages = workflow.Project.open("p").settings.design.stages
     assert stages[-1].control == (control + 3, control + 3)
-    assert stages[-1].rays == rays and len(stages) == {5: 1, 20: 2, 90: 3}[limit]
+    assert stages[-1].rays == rays and len(stages) == {5: 1, 20: 2, 90: 2}[limit]
 
 
 @pytest.mark.parametrize("limit, stages", [(20, 1), (90, 2)])

@@ -124,7 +124,7 @@ def coarse_to_fine(
 GAPS = 0.5
 #: Factor of the iterations where the image is blurred by the source, and on the wave image where the loss is that of a laser beam:
 #: an iteration takes 0.05 s there, and lowers the error by a percent up to some hundreds of them.
-LONGER, LONGER_BEAMS = 3, 10
+LONGER, LONGER_BEAMS = 4, 10
 #: Source cells of the transport start along the lens: rays of the last stage per cell, and most cells.
 RAYS_PER_CELL, MOST_CELLS = 4, 1024
 #: Largest prime factor of a length with fast transforms.
