@@ -53,7 +53,8 @@ def new_project(
     picture = (
         target
         if isinstance(target, Picture)
-        else _of_lamps(target, said, parameters, say) or read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
+        else _of_lamps(target, said, parameters, say)
+        or read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
     )
     if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
         del said["source"]["weights"]
