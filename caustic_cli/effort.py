@@ -105,20 +105,20 @@ class Effort:
     #: (pixels of the target, rays, iterations, weight of the light that is lost) of each stage.
     lamp_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 20_000, 100, 0.1),
-        (6_000, 60_000, 150, 0.03),
-        (24_000, 500_000, 400, 0.008),
+        (5_600, 60_000, 150, 0.03),
+        (24_000, 1_000_000, 200, 0.006),
     )
     #: The same for two free-form surfaces, after the first of the stages above with one.
     two_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 30_000, 150, 0.2),
-        (6_000, 60_000, 80, 0.03),
-        (24_000, 250_000, 150, 0.012),
+        (5_600, 60_000, 80, 0.03),
+        (24_000, 500_000, 110, 0.012),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.
     chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_100, 300_000, 90, 0.045),)
     #: Spans of the spline along both axes in a stage with enough pixels; cells of the light along both axes for the transport;
     #: pixels by which the uniformity of the light is judged.
-    lamp_spans: int = 64
+    lamp_spans: int = 128
     lamp_cells: int = 44
     lamp_coarse: int = 2_700
 

@@ -19,7 +19,6 @@ from caustic_cli.inverse.lamp import (
     design_lamp,
     directions_of,
     field_of,
-    finely,
     judged_pixels,
     pixels_of,
     refined,
@@ -465,8 +464,8 @@ def test_the_loss_is_differentiable_to_second_order_remainders(chip):
 
 def test_a_net_of_more_spans_is_the_same_surface():
     effort = replace(STANDARD, lamp_spans=16)
-    assert [field_of(effort, pixels).shape[0] for pixels in (800, 700, 190)] == [19, 11, 7]
-    coarse, fine = field_of(effort, 190), field_of(effort)
+    assert [field_of(effort, pixels).shape[0] for pixels in (360, 350, 80)] == [19, 11, 7]
+    coarse, fine = field_of(effort, 80), field_of(effort)
     values, (u, v) = torch.stack([bumpy(coarse), bumpy(coarse, seed=3)]), 1.8 * random(2, 50) - 0.9
     for one, other in zip(values, refined(coarse, values, fine), strict=True):
         torch.testing.assert_close(torch.stack(coarse.at(one, u, v)), torch.stack(fine.at(other, u, v)), rtol=0, atol=1e-12)
@@ -478,22 +477,20 @@ def test_a_lamp_is_judged_on_pixels_half_as_wide_as_those_refined():
         assert judged_pixels(lamp, goal, STANDARD) == (2 * across, 2 * along)
 
 
-def test_pixels_along_the_edges_are_half_as_wide():
-    """All light of the screen is compared once, and the loss is the squared relative error on pixels of either width."""
+def test_pixels_of_a_point_are_half_as_wide():
+    """All are compared, and the loss is the squared relative error on them, on the apron as within."""
     goal = Goal((80.0, 40.0))
     one = LampObjective(Lamp(), goal, FIELD, wanted(goal, np.ones((2, 2)), (40, 20)), 3000)
-    wide, fine = one.coarse_weights > 0, one.fine_weights > 0
-    assert bool((finely(wide.double()).bool() ^ fine).all())
-    assert wide[APRON:-APRON, APRON:-APRON].nonzero().tolist() == [[i, j] for i in range(3, 17) for j in range(3, 7)]
-    assert wide.sum() == 14 * 4 and float(one.coarse_weights.max()) == 20 * 10 and float(one.fine_weights.max()) == 40 * 20
+    assert one.weights.shape == one.target.shape == (40 + 4 * APRON, 20 + 4 * APRON)
+    assert bool((one.weights == 40 * 20).all())
 
 
 def test_the_edges_that_a_chip_blurs_count_little():
     goal = Goal((80.0, 40.0))
     target = wanted(goal, np.ones((2, 2)), (40, 20))
     other = LampObjective(Lamp(Chip("disc", (0.5, 0.5))), goal, FIELD, target, 3000)
-    counted = other.coarse_weights / other.coarse_weights.max()
-    assert not other.fine_weights.any() and 0 < float(counted.min()) < 0.02
+    counted = other.weights / other.weights.max()
+    assert counted.shape == (20 + 2 * APRON, 10 + 2 * APRON) and 0 < float(counted.min()) < 0.02
     assert float((counted == 1.0).sum()) == (20 - 2) * (10 - 2)  # less 3.8 degrees, a pixel of 4, at every edge
     assert float((other.target * other.seen).sum()) == pytest.approx(1.0) and float(other.target.sum()) > 1.2
 

@@ -11,7 +11,7 @@ from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lamp import directions_of, pixels_of
 from caustic_cli.io.photometry import Photometry, read_photometry, write_ies, write_ldt
-from caustic_cli.project.photometric_target import PIXELS, angles_of, picture_of
+from caustic_cli.project.photometric_target import PIXELS, angles_of, edges_of, picture_of
 from caustic_cli.scene.lamp import Goal
 
 PLANES, ANGLES = 15.0 * np.arange(24), 5.0 * np.arange(37)
@@ -205,6 +205,16 @@ def test_a_lamp_throws_the_light_of_a_file(write, capfd):
     assert np.corrcoef(one, other)[0, 1] > 0.9 > np.corrcoef(one, turned)[0, 1] + 0.1
     text = Path("far/project.toml").read_text()
     assert "angles = [" in text and torch.from_numpy(np.load("far/target.npy")).min() >= 0.0
+
+
+def test_a_file_with_sharp_edges_says_that_they_are_lost(capfd):
+    planes, angles = 5.0 * np.arange(72), np.arange(181.0)
+    smooth = light_of(lambda plane, gamma: 300.0 * np.exp(-((gamma / 45.0) ** 8)) + 0.0 * plane, planes, angles)
+    assert edges_of(smooth) == "" != edges_of(smooth._replace(angles=10.0 * np.arange(19.0), values=smooth.values[:, ::10]))
+    write_ldt(Path("sharp.ldt"), light_of(lambda plane, gamma: 300.0 * (gamma < 40.2) + 0.0 * plane, planes, angles))
+    assert cli.run(["design", "sharp.ldt", "--lamp", "15", "--lamp-inner", "30", "-o", "far.caustic"]) == 2
+    line, _ = capfd.readouterr().err.splitlines()
+    assert "sharp.ldt: has sharp edges, within one of its steps of 1 degrees" in line and "--angles" in line
 
 
 def test_photometric_targets_are_refused_in_one_line(capfd):

@@ -4,8 +4,8 @@
 
 rho     relative RMS error of the power on the pixels of the target and of an apron around it, the image divided by its own sum;
         of a chip, which blurs the edges, those of a border and of the apron count little, and the image is divided by its sum on
-        the interior.  Of a point, pixels along the edges of the light are half as wide as others: on wide ones an edge that is not
-        sharp is made up for by too much light beside it
+        the interior.  Of a point pixels are half as wide: on wide ones an edge that is not sharp is made up for by too much light
+        beside it, and the fold in which the light ends at the rim needs a spline finer than wide pixels show
 w       weight of the light that does not arrive, all light of the chip counting 1.  Where light is scarce, at the rim of the
         hemisphere, both terms compete: it is large at first, so that light comes onto the target, and small in the last stage
 """
@@ -19,7 +19,6 @@ from functools import partial
 
 import numpy as np
 import torch
-from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
 from caustic_cli.effort import STANDARD, Effort
@@ -39,14 +38,13 @@ from caustic_cli.scene.lamp import Goal, Lamp
 MARGIN = 0.005
 #: Dark pixels around the target on which light beside it is seen; and the filter of the image.
 APRON, FILTER = 4, Filter("cosine", (3, 3))
-#: Pixels of the edges along either axis in one of the others; others from a dark one within which edges are; and how dark that is
-#: relative to the brightest one there.
-FINER, REACH, DARK = 2, 3, 0.1
+#: Pixels of a point's loss along either axis in one of a stage.
+FINER = 2
 #: Points of a chip along both of its axes; weight of the pixels on the border that it blurs, and of the apron.
 CHIP_POINTS, BLURRED = 8, 0.015
-#: Least pixels of a stage per square of a span of the spline: finer waves than pixels show would grow unseen, and cost most of the
-#: iterations of the following stage.
-PER_SPAN = 3
+#: Least pixels of a stage per square of a span of the spline, of a point FINER^2 times as many: finer waves than pixels show would
+#: grow unseen, and cost most of the iterations of the following stage.
+PER_SPAN = 1.4
 #: Degree of the spline: with 5 the error of 30 x 10 m from 8 m by two surfaces was 0.0114 instead of 0.0102.
 DEGREE = 3
 #: Points of a grid at which limits of two surfaces hold, weight of their squares, the wall there over that to be kept, and the
@@ -95,23 +93,12 @@ def coarse(image: Tensor) -> Tensor:
     return image.view(n // FINER, FINER, m // FINER, FINER).sum((1, 3))
 
 
-def finely(image: Tensor) -> Tensor:
-    """An image on pixels finer by FINER, of the same values."""
-    return image.repeat_interleave(FINER, 0).repeat_interleave(FINER, 1)
-
-
-def _edges(image: Tensor) -> Tensor:
-    """1 on pixels within REACH of both light and dark, else 0."""
-    around = [f(image.numpy(), 2 * REACH + 1, mode="constant") for f in (minimum_filter, maximum_filter)]
-    return torch.from_numpy(around[0] < DARK * around[1]).double()
-
-
 class LampObjective:
     """The loss of control values, (n, m) or (2, n, m) (`optics.lamp.sides`), for fixed rays: of a point those of a grid, of a
     chip those of grids from several of its points.
 
     Args:
-        target: (n_x, n_y) as of `wanted`, on the pixels of edges: multiples of FINER.
+        target: (n_x, n_y) as of `wanted`, FINER times as many along each axis as a stage has.
         rays: about.
         weight: w, see the module; of a chip for a blur as wide as the border, and in proportion to it, since the light at stake at
             the edges is.
@@ -129,11 +116,10 @@ class LampObjective:
         self.inside = torch.nn.functional.pad(torch.ones_like(target), (apron,) * 4, value=float(point))
         self.seen = torch.ones_like(smooth) if point else self._interior(lamp, shape)
         self.target = smooth / (smooth * self.seen).sum()
-        edges = _edges(coarse(smooth)) if point else torch.zeros_like(coarse(smooth))
+        self.over = (lambda image: image) if point else coarse
         counted = self.seen + BLURRED * (1.0 - self.seen)
         lit = torch.nn.functional.pad(target, (apron,) * 4) * self.seen
-        self.coarse_weights = (1.0 - edges) * coarse(counted) / FINER**2 * float((coarse(lit) > 0).sum())
-        self.fine_weights = finely(edges) * counted * float((lit > 0).sum())
+        self.weights = self.over(counted) / self.over(torch.ones_like(counted)) * float((self.over(lit) > 0).sum())
         self.splat = backend_for("cpu").splat
         brightest = float((target.numpy() / goal.shares(shape)).max())
         self.limits = SurfaceLimits(lamp, goal, field, brightest) if lamp.surfaces == 2 else None
@@ -150,9 +136,8 @@ class LampObjective:
     def terms(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """rho^2, efficiency, mean distance beside the target, and lack of margin."""
         image, distance, lack = (sum(part) for part in zip(*(self._see(rays, values) for rays in self.rays), strict=True))
-        residual = image / (image * self.seen).sum() - self.target
-        square = (self.coarse_weights * coarse(residual) ** 2).sum() + (self.fine_weights * residual**2).sum()
-        return square, (image * self.inside).sum(), distance, lack
+        residual = self.over(image / (image * self.seen).sum() - self.target)
+        return (self.weights * residual**2).sum(), (image * self.inside).sum(), distance, lack
 
     def _see(self, rays, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Contributions of some rays to the image, to the distance beside the target and to the lack of margin."""
@@ -292,7 +277,7 @@ def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Lamp, tuple[int, int, in
 
 
 def judged_pixels(lamp: Lamp, goal: Goal, effort: Effort) -> tuple[int, int]:
-    """Pixels on which a lamp is judged: half as wide along both axes as those of the last stage, which show what the design saw."""
+    """Pixels on which a lamp is judged: half as wide along both axes as those of the last stage; of a point those of its loss."""
     across, along = pixels_of(goal, stages_of(lamp, effort)[-1][1][0])
     return 2 * across, 2 * along
 

@@ -273,14 +273,23 @@ class FarProjection(BeamProjection):
         return (ahead + along @ shape_of(self.screen).centre)[:2], along[:2]
 
     def directions_to(self, u: np.ndarray, v: np.ndarray) -> Callable[..., tuple]:
-        """As of a `ScreenProjection`."""
-        ahead = tuple(c.reshape(np.shape(u)) for c in self._ahead(u, v))
+        """As of a `ScreenProjection`; exact, though (u, v) of a tilted screen are linear in its coordinates."""
+        own = [(c + at) / self.distance for c, at in zip(self.screen_coordinates(u, v), shape_of(self.screen).centre, strict=True)]
+        own.append(self.forward * np.sqrt(np.maximum(1.0 - own[0] ** 2 - own[1] ** 2, 0.0)))
+        ahead = tuple(sum(c * axis[k] for c, axis in zip(own, self.screen.axes, strict=True)) for k in range(3))
         return lambda x, y, z: ahead
 
     def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As of a `ScreenProjection`; linear, also of a screen that is tilted."""
         middle, by = self._linear
         return middle[0] + by[0, 0] * x + by[0, 1] * y, middle[1] + by[1, 0] * x + by[1, 1] * y
+
+    def screen_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As of a `ScreenProjection`; the inverse of `project`."""
+        middle, by = self._linear
+        back = np.linalg.inv(by)
+        a, b = u - middle[0], v - middle[1]
+        return back[0, 0] * a + back[0, 1] * b, back[1, 0] * a + back[1, 1] * b
 
 
 def projection_of(scene: Scene, mean: float) -> ScreenProjection | None:

@@ -53,7 +53,8 @@ def new_project(
     picture = (
         target
         if isinstance(target, Picture)
-        else _of_lamps(target, said, parameters) or read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
+        else _of_lamps(target, said, parameters, say)
+        or read_picture(target, goal.encoding == "linear", goal.color, parameters.invert)
     )
     if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
         del said["source"]["weights"]
@@ -81,7 +82,7 @@ def new_project(
     return Project(out, full, picture, asked, without_waves=without_waves(full, "stages" in said.get("design", {}))), said
 
 
-def _of_lamps(target: Path | Piped, said: Given, parameters: Parameters) -> Picture | None:
+def _of_lamps(target: Path | Piped, said: Given, parameters: Parameters, say: Callable[[str], None]) -> Picture | None:
     """The picture of a target that follows from where a lamp throws it, a photometric file or that of `road_target`, None for
     another; without a size of its picture a lamp gets the angles of the file's light.
 
@@ -97,6 +98,8 @@ def _of_lamps(target: Path | Piped, said: Given, parameters: Parameters) -> Pict
         what = "the illuminance of a road" if by_name else "a photometric file"
         raise InputError(f"{target}: is {what}, whose light lamps throw: ⟨+lamp.radius⟩ is needed")
     lamp, light = said["lamp"], None if by_name else read_photometry(target)
+    if light and (edges := photometric_target.edges_of(light)):
+        say(f"{target}: {edges}")
     try:
         if light and "angles" not in lamp and "picture_size" not in parameters and "size" not in said.get("target", {}):
             said["lamp"] = {**lamp, "angles": photometric_target.angles_of(light, lamp.get("projection", "latitude"))}

@@ -432,7 +432,7 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         found.append(("upper edge", f"{figures['cut_off']:.2f} degrees from 90 % to 10 % of the intensity beneath it"))
     found += [
         ("least wall", f"{figures['least_wall']:.3g} mm; greatest radius {figures['greatest_radius']:.4g} mm"),
-        ("rays", f"{figures['rays']:,} on {width} x {height} pixels, half as wide as those refined; their noise is subtracted"),
+        ("rays", f"{figures['rays']:,} on {width} x {height} pixels; their noise is subtracted"),
         ("iterations", number("iterations", "d")),
         ("time", f"{figures['seconds']:.1f} s"),
     ]

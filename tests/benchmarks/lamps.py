@@ -1,4 +1,4 @@
-"""Lamps: light on the target and its error, on pixels half as wide along both axes as those that the design saw.
+"""Lamps: light on the target and its error, on the pixels of the loss of a point, and of a chip on ones half as wide as those.
 
     python tests/benchmarks/lamps.py [--only street,two] [--rays 16e6] [-o FILE.json]
 
@@ -133,15 +133,15 @@ def main() -> None:
         if options.out:
             options.out.write_text(json.dumps(found, indent=1))
     print(f"on {os.cpu_count()} cores")
-    print("| lamp | light | asked | error | asked | with the border | least wall, mm | pixels | seconds | of the clock |")
+    print("| lamp | light | asked | error | without a border | asked | least wall, mm | pixels | seconds | of the clock |")
     print("| --- " * 10 + "|")
     for name, problem in PROBLEMS.items():
         if name in found:
             f = found[name]
             print(
-                f"| {WORDS[name]} | {f['of_source']:.3f} | {problem.light:g} | {f['interior_rms']:.4f} ± {f['interior_noise']:.4f}"
-                f" | {problem.error:g} | {f['relative_rms']:.3f} | {f['least_wall']:.2f} | {' x '.join(map(str, f['pixels']))}"
-                f" | {f['seconds']:.0f} | {f['wall']:.0f} |"
+                f"| {WORDS[name]} | {f['of_source']:.4f} | {problem.light:g} | {f['relative_rms']:.4f} ± {f['noise']:.4f}"
+                f" | {f['interior_rms']:.4f} ± {f['interior_noise']:.4f} | {problem.error:g} | {f['least_wall']:.2f}"
+                f" | {' x '.join(map(str, f['pixels']))} | {f['seconds']:.0f} | {f['wall']:.0f} |"
             )
     for name in PASSAGES:
         if name in found:

@@ -24,7 +24,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
-from caustic_cli.scene.screen import FOCAL
+from caustic_cli.scene.screen import FOCAL, tilted
 from caustic_cli.scene.sources.gaussian import Gaussian
 from caustic_cli.studies.manufacture import manufacture
 
@@ -202,6 +202,22 @@ def test_a_mirror_sends_its_picture_there_too():
     picture = by_rays(scene, field, torch.from_numpy(np.asarray(found.heights)), 1 << 20)
     error = picture / picture.sum() - target / target.sum()
     assert np.sqrt((error**2).mean()) * target.size < 0.25 and picture.sum() > 0.9
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 45.0), (30.0, -40.0)])
+def test_a_mirror_at_an_angle_starts_with_the_picture(tilt):
+    """Over 300 mrad: direction cosines along the mirror are not linear in those along the screen; 0.17 if they were."""
+    x, y, z = (FOCAL * c for c in tilted(tilt)[2])
+    screen = Screen((300.0, 300.0), -FOCAL, (64, 64), tilt=(-tilt[0], -tilt[1]), shift=(FOCAL * x / z, FOCAL * y / z), far=True)
+    edge = np.clip((0.8 - np.abs(np.linspace(-1, 1, 65)[1:] - 1.0 / 64)) / 0.2, 0.0, 1.0)
+    target = np.outer(edge, edge)
+    lens = Lens((8.0, 8.0), control=(60, 60), mirror=True, offset=Offset(0.0, (-60.0, -60.0)))
+    scene = Scene(PlaneWave(tilt=tilt), lens, screen)
+    field = HeightField.of(lens)
+    found = first_surface(scene, target, field, 128)
+    picture = by_rays(scene, field, torch.from_numpy(np.asarray(found.heights)), 1 << 20)
+    error = picture / picture.sum() - target / target.sum()
+    assert np.sqrt((error**2).mean()) * target.size < 0.08 and picture.sum() > 0.98
 
 
 def test_an_error_of_the_throw_changes_nothing():
