@@ -264,7 +264,7 @@ COARSE = ((32, 6, 1.0, 4), (48, 8, 1.0, 5))
 
 
 def test_the_relief_of_parts_of_the_right_height_is_so_within_its_uncertainty(lens, here, monkeypatch):
-    """It came out up to seven standard deviations too low when pixels and rays were averaged differently."""
+    """It came out 1 to 2.5 % too low, up to seven standard deviations, when pixels and rays were averaged differently."""
     monkeypatch.setattr(inference, "LEVELS", ((32, 6, 1.0, 3), (48, 12, 0.7, 8)))
     monkeypatch.setattr(photographs, "RAYS", 120)
     off = []
@@ -272,9 +272,9 @@ def test_the_relief_of_parts_of_the_right_height_is_so_within_its_uncertainty(le
         error = form_error(5.0, rms, length, 60 + seed) if rms else None
         marks = photograph(lens, error, SHARP, seed, size=(450, 400), blur=0.8, rays=700)
         scale, sigma = judged(lens, marks).found.scale
-        assert sigma < 0.008
+        assert abs(scale - 1.0) < 0.014 and sigma < 0.012
         off.append((scale - 1.0) / sigma)
-    assert np.sqrt(np.square(off).mean()) < 1.7 and max(np.abs(off)) < 3.0
+    assert np.sqrt(np.square(off).mean()) < 1.5 and max(np.abs(off)) < 2.5
 
 
 def test_predicted_errors_are_those_of_many_rays(lens):
@@ -309,10 +309,10 @@ def test_photographs_at_two_throws_tell_the_scale_of_the_relief_from_the_throw(l
     far = at_throw(lens, "far", made, error, 450, 453, 1.6, seed=1)
     alone, both = judged(lens, photos=[near]), judged(lens, photos=[near, far])
     (product, sigma), own = alone.found.scale, 1.02 * 303 / 300
-    assert abs(product - own) < 3.5 * sigma < 0.01 and not alone.found.throws_free
+    assert abs(product - own) < 2.5 * sigma < 0.02 and not alone.found.throws_free
     scale, sigma = both.found.scale
-    assert abs(scale - 1.02) < 2.5 * sigma < 0.02
-    assert both.found.of_view(0)[13] < 2.5 and abs(both.found.guess.views[0].throw - 3.0) < 2.5 * both.found.of_view(0)[13]
+    assert abs(scale - 1.02) < 2.5 * sigma < 0.03
+    assert both.found.of_view(0)[13] < 4.5 and abs(both.found.guess.views[0].throw - 3.0) < 2.5 * both.found.of_view(0)[13]
     words = " ".join(both.figures["part"]["not_told_apart"])
     assert "throw" not in words and "throw and index" in " ".join(alone.figures["part"]["not_told_apart"])
     assert len(both.figures["others"]) == 1 and both.figures["others"][0]["file"] == "far.jpg"
@@ -489,14 +489,14 @@ def test_photographs_in_two_lights_are_judged_together(name, lens, here, monkeyp
     found = json.loads(capfd.readouterr().out)["photo"]
     part = found["part"]
     assert found["explained"] > 0.999 and found["others"][0]["explained"] > 0.999
-    assert abs(part["relief_scale"] - 1.0) < 3 * part["relief_scale_sigma"] < 0.015
+    assert abs(part["relief_scale"] - 1.0) < 2.5 * part["relief_scale_sigma"] < 0.02
     off = np.load("r-deviation.npy") - error
     assert off.std() < 2.5e-3 * part["uncertainty_um"] < 1.5e-3
     alone = judged(glass, photos=[first]).found
     assert part["uncertainty_um"] < 1e3 * alone.uncertainty()
     if name == "blue":  # taken for yellow light, its relief seems higher by the index
         Path(second).write_text(Path(second).read_text().split("[source]")[0])
-        assert judged(glass, photos=[second]).found.scale[0] == pytest.approx((bk7(0.4358) - 1) / (bk7(0.5876) - 1), abs=0.007)
+        assert judged(glass, photos=[second]).found.scale[0] == pytest.approx((bk7(0.4358) - 1) / (bk7(0.5876) - 1), abs=0.009)
 
 
 # Refusals

@@ -59,7 +59,7 @@ def taken(home, lens, heights, error, sigma, seed, **how):
 def judged(lens, um, length, sigma, seed, by_waves=False, **how):
     """A row of figures: nominal, as made, predicted and after the correction, registered and in the frame of the wall."""
     error = form_error(lens.field.half_size[0], 1e-3 * um, 2 * lens.field.half_size[0] * length, seed)
-    aim, rays = lens.target / lens.target.mean(), how.pop("judged_by", 1400)
+    aim, rays = lens.target / lens.target.mean(), how.pop("judged_by", 2000)
 
     def errors(heights, off):
         image = image_of(lens, heights, off, lens.target.shape, rays=rays)
