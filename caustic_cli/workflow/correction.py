@@ -42,7 +42,7 @@ from caustic_cli.workflow.reporter import Reporter
 #: Draws from the posterior; rays per pixel of each of the two images by which one is judged, and least and most of them.
 DRAWS, EACH, LEAST, MOST = 8, 64, 200_000, 8_000_000
 #: Least part of a photograph's variance that a fit must explain, and least gain over its standard deviation.
-EXPLAINED, CERTAIN = 0.98, 2.0
+EXPLAINED, CERTAIN = 0.99, 2.0
 #: The former without marks, where the wrong part explains much, too.
 EXPLAINED_ALONE = 0.9995
 PLOT = "correction.png"
