@@ -106,6 +106,8 @@ LONG = (
     "test_no_correction_makes_a_part_worse",
     "test_parts_in_other_light_and_mirrors_are_judged_too",
     "test_photographs_at_two_throws_tell_the_scale_of_the_relief_from_the_throw",
+    "test_photographs_in_two_lights_are_judged_together",
+    "test_the_relief_of_parts_of_the_right_height_is_so_within_its_uncertainty",
     "test_a_corrected_part_is_better_by_the_stated_amount",
     "test_the_simulated_cut_is_that_of_the_arcs[simple-inch]",
     "test_corners_and_the_picture_itself_find_the_screen_too",

@@ -22,7 +22,7 @@ from caustic_cli.workflow import correction, photographs
 from caustic_cli.workflow.reporter import Listener
 
 sys.path.insert(0, str(Path(__file__).parent / "independent"))
-from photographs import form_error, image_of, landed_from, photographed, relative_rms
+from photographs import form_error, image_of, landed, landed_from, photographed, relative_rms
 
 #: Standard deviation of the marks of a file, pixels.
 SHARP, BLURRED = 0.05, 0.25
@@ -151,6 +151,16 @@ def test_a_photograph_is_brought_into_screen_coordinates():
     assert np.nanmax(np.abs(half - screen[20:])) < 0.01
 
 
+@pytest.mark.parametrize(("splined", "variance"), [(False, 1 / 12), (True, 1 / 4)])
+def test_a_photograph_is_averaged_over_pixels_or_by_splines_about_them(splined, variance):
+    """The mean of x^2 is larger than that of the middle by the variance of the weights, of pixels of 1/10."""
+    camera = seen_by(np.array([300.0, 0.0, 409.5, 0.0, -330.0, 399.5, 0.0, 0.0]), 0.0, SIZE)
+    a = (np.arange(SIZE[0]) - 409.5) / 300.0
+    screen = rectified(np.broadcast_to(a**2, SIZE[::-1]), camera, (20, 16), splined=splined)
+    x = (np.arange(20) + 0.5) / 10 - 1
+    np.testing.assert_allclose(screen, np.repeat((x**2 + variance / 100)[:, None], 16, 1), atol=3e-5)
+
+
 def test_the_marks_of_the_card_are_found_however_it_lies(lens, here):
     data, project = photographed(lens, lens.heights, None, marks=(marks_of_card(), RADIUS), background=0.05)
     codes = np.asarray(Image.open(io.BytesIO(data)), float) / 255
@@ -253,12 +263,34 @@ def test_one_photograph_is_enough_for_a_smooth_form_error(lens, here, rms, sigma
 COARSE = ((32, 6, 1.0, 4), (48, 8, 1.0, 5))
 
 
-def at_throw(lens, name, heights, error, said, true, larger=1.0, seed=0) -> str:
+def test_the_relief_of_parts_of_the_right_height_is_so_within_its_uncertainty(lens, here, monkeypatch):
+    """It came out 1 to 2.5 % too low, up to seven standard deviations, when pixels and rays were averaged differently."""
+    monkeypatch.setattr(inference, "LEVELS", ((32, 6, 1.0, 3), (48, 12, 0.7, 8)))
+    monkeypatch.setattr(photographs, "RAYS", 120)
+    off = []
+    for seed, (rms, length) in enumerate([(0.0, 1.0), (0.3e-3, 5.0), (1e-3, 10 / 3), (1e-3, 2.0), (3e-3, 10 / 3), (3e-3, 5.0)]):
+        error = form_error(5.0, rms, length, 60 + seed) if rms else None
+        marks = photograph(lens, error, SHARP, seed, size=(450, 400), blur=0.8, rays=700)
+        scale, sigma = judged(lens, marks).found.scale
+        assert abs(scale - 1.0) < 0.014 and sigma < 0.012
+        off.append((scale - 1.0) / sigma)
+    assert np.sqrt(np.square(off).mean()) < 1.5 and max(np.abs(off)) < 2.5
+
+
+def test_predicted_errors_are_those_of_many_rays(lens):
+    """Noise of few rays is no error of a part: it made 0.10 of 0.04."""
+    aim = lens.target / lens.target.mean()
+    image = image_of(lens, lens.heights, None, aim.shape, rays=3000)
+    expected = relative_rms(registered(image, aim), aim), relative_rms(image, aim)
+    assert correction.errors_of(lens, lens.heights) == pytest.approx(expected, abs=0.007)
+
+
+def at_throw(lens, name, heights, error, said, true, larger=1.0, seed=0, light=None) -> str:
     """Write a photograph of a screen `larger` times as large, a TOML file that names it, and its marks; the name of that file."""
     screen = lens.scene.screen
     size = [larger * s for s in screen.size]
     seen = replace(lens, scene=replace(lens.scene, screen=replace(screen, size=tuple(size))))
-    data, project = photographed(seen, heights, error, seed=seed, throw=true, rays=700)
+    data, project = photographed(seen, heights, error, seed=seed, throw=true, rays=700, light=light)
     Path(f"{name}.jpg").write_bytes(data)
     known = marks_of_card()
     pixels = np.stack(project(*known.T), 1) + SHARP * np.random.default_rng(seed + 100).standard_normal(known.shape)
@@ -277,10 +309,10 @@ def test_photographs_at_two_throws_tell_the_scale_of_the_relief_from_the_throw(l
     far = at_throw(lens, "far", made, error, 450, 453, 1.6, seed=1)
     alone, both = judged(lens, photos=[near]), judged(lens, photos=[near, far])
     (product, sigma), own = alone.found.scale, 1.02 * 303 / 300
-    assert abs(product - own) < 3.5 * sigma < 0.01 and not alone.found.throws_free
+    assert abs(product - own) < 2.5 * sigma < 0.02 and not alone.found.throws_free
     scale, sigma = both.found.scale
-    assert abs(scale - 1.02) < 2.5 * sigma < 0.02
-    assert both.found.of_view(0)[13] < 2.5 and abs(both.found.guess.views[0].throw - 3.0) < 2.5 * both.found.of_view(0)[13]
+    assert abs(scale - 1.02) < 2.5 * sigma < 0.03
+    assert both.found.of_view(0)[13] < 4.5 and abs(both.found.guess.views[0].throw - 3.0) < 2.5 * both.found.of_view(0)[13]
     words = " ".join(both.figures["part"]["not_told_apart"])
     assert "throw" not in words and "throw and index" in " ".join(alone.figures["part"]["not_told_apart"])
     assert len(both.figures["others"]) == 1 and both.figures["others"][0]["file"] == "far.jpg"
@@ -419,6 +451,52 @@ def test_parts_in_other_light_and_mirrors_are_judged_too(name, lens, here, monke
     off = surfaces(found.found)[1] - error
     assert found.found.explained > 0.999
     assert off.std() < 0.3 * rms and off.std() < 2.5 * found.found.uncertainty() < 1.5 * rms
+
+
+def bk7(um):
+    """Index of N-BK7 by the dispersion formula of its maker (Schott, optical glass data sheets, 2017)."""
+    B, C = (1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653)
+    return float(np.sqrt(1 + sum(b * um**2 / (um**2 - c) for b, c in zip(B, C, strict=True))))
+
+
+#: A second light: its section of a photograph's file, how much larger its screen is, and how the independent tracer has it.
+SECOND = {
+    "blue": ("wavelengths = [435.8]", 1.0, lambda lens, error: landed(lens, lens.heights, error, rays=700, index=bk7(0.4358))),
+    "a point": (
+        'type = "point"\nposition = [[0.0, 0.0, -200.0]]',
+        1.6,
+        lambda lens, error: landed_from(lens, lens.heights, error, point=(0.0, 0.0, -200.0)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SECOND)
+def test_photographs_in_two_lights_are_judged_together(name, lens, here, monkeypatch, capfd):
+    """Of a lens of N-BK7 in yellow light and in another: its index in blue is 1.9 % higher less one, which is not of the part."""
+    monkeypatch.setattr(inference, "LEVELS", COARSE)
+    monkeypatch.setattr(photographs, "RAYS", 120)
+    size = ["--mag", "3", "--resolution", "64", "--control", "35", "--glass", "BK7"]
+    how = [*size, "--waves", "off", "--iterations", "15", "--rays", "100000", "--quiet"]
+    assert cli.run(["design", str(lens.project.path.parent / "picture.npy"), *how, "-o", "glass.caustic"]) == 0
+    glass, error = load("glass.caustic"), form_error(5.0, 1e-3, 5.0, 1)
+    section, larger, light = SECOND[name]
+    first = at_throw(glass, "first", glass.heights, error, 300, 300)
+    second = at_throw(glass, "second", glass.heights, error, 300, 300, larger, seed=1, light=light(glass, error))
+    Path(second).write_text(Path(second).read_text() + f"[source]\n{section}\n")
+    capfd.readouterr()
+    arguments = ["--photo", first, "--photo", second, "--rays", "20000", "-o", "r.png", "--json", "--quiet"]
+    assert cli.run(["render", "glass.caustic", *arguments]) == 0
+    found = json.loads(capfd.readouterr().out)["photo"]
+    part = found["part"]
+    assert found["explained"] > 0.999 and found["others"][0]["explained"] > 0.999
+    assert abs(part["relief_scale"] - 1.0) < 2.5 * part["relief_scale_sigma"] < 0.02
+    off = np.load("r-deviation.npy") - error
+    assert off.std() < 2.5e-3 * part["uncertainty_um"] < 1.5e-3
+    alone = judged(glass, photos=[first]).found
+    assert part["uncertainty_um"] < 1e3 * alone.uncertainty()
+    if name == "blue":  # taken for yellow light, its relief seems higher by the index
+        Path(second).write_text(Path(second).read_text().split("[source]")[0])
+        assert judged(glass, photos=[second]).found.scale[0] == pytest.approx((bk7(0.4358) - 1) / (bk7(0.5876) - 1), abs=0.009)
 
 
 # Refusals

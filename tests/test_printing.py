@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import zipfile
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -90,3 +91,18 @@ def test_the_command_advises(tmp_path, monkeypatch, capfd):
         assert words.split()[0] in err and err.count("\n") == 1
     assert cli.run(shlex.split("export a.caustic --format stl --printer 50,5")) == 2
     assert "--printer belongs to --format 3mf" in capfd.readouterr().err
+    assert cli.run(shlex.split("export a.caustic --format gcode --pin 4")) == 2
+    assert "--pin is of a lens with two free-form sides" in (err := capfd.readouterr().err) and err.count("\n") == 1
+    assert not Path("a.nc").exists()
+
+
+def test_the_printer_of_a_finish_is_advised_on(tmp_path, monkeypatch, capfd):
+    """That of --printer comes first."""
+    monkeypatch.chdir(tmp_path)
+    write_blob()
+    how = "--mag 2 --resolution 24 --waves off --rays 20000 --iterations 2 --finish printed:20,500+coated:5"
+    assert cli.run(shlex.split(f"design blob.png {how} -o a.caustic -q")) == 0
+    for more, layer in (("", 20.0), ("--printer 50,5", 50.0)):
+        capfd.readouterr()
+        assert cli.run(shlex.split(f"export a.caustic --format 3mf --samples 21 --json --force {more}")) == 0
+        assert json.loads(capfd.readouterr().out)["3mf"]["steps_um"]["up"] == pytest.approx(layer / 12**0.5, rel=0.5)

@@ -305,6 +305,11 @@ def points(steps: tuple[Finish, ...], field: HeightField) -> tuple[int, int]:
     return found[0], found[1]
 
 
+def printer(text: str) -> tuple[float, float] | None:
+    """Layers and pixels, mm, of the printer among the steps of a finish; None without one."""
+    return next(((step.layer, step.pixel) for step in parse(text) if isinstance(step, Printed)), None) if text else None
+
+
 def finished(steps: tuple[Finish, ...], relief: Relief, like: HeightField) -> tuple[HeightField, Tensor]:
     """The surface after all steps: on a net with all details where a printer or a tool left some, else on that of the lens, `like`;
     relief: before the steps, at so many `points`."""

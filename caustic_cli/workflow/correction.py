@@ -39,10 +39,10 @@ from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.photographs import Judged
 from caustic_cli.workflow.reporter import Reporter
 
-#: Draws from the posterior, and rays per pixel and least of all for their images.
-DRAWS, EACH, LEAST = 8, 32, 200_000
+#: Draws from the posterior; rays per pixel of each of the two images by which one is judged, and least and most of them.
+DRAWS, EACH, LEAST, MOST = 8, 64, 200_000, 8_000_000
 #: Least part of a photograph's variance that a fit must explain, and least gain over its standard deviation.
-EXPLAINED, CERTAIN = 0.98, 2.0
+EXPLAINED, CERTAIN = 0.99, 2.0
 #: The former without marks, where the wrong part explains much, too.
 EXPLAINED_ALONE = 0.9995
 PLOT = "correction.png"
@@ -132,14 +132,9 @@ def predicted(lens: Lens, judged: Judged, heights: Tensor) -> dict[str, Any]:
     the frame of the screen; gain and its standard deviation, of registered errors; and how far H' is from H, RMS in µm.  Light of
     the photograph that the fit does not explain may be of the part: it counts as uncertainty."""
     known = judged.before.deviation if judged.before is not None else torch.zeros_like(lens.heights)
-    target = np.asarray(lens.target)
-    rays = max(LEAST, EACH * target.size)
 
     def errors(sent: Tensor, guess: Guess) -> tuple[float, float]:
-        part = scaled(sent + known, guess.scale) + deviation(lens.field, guess.modes)
-        image = retrace(lens.scene, lens.field, part, target, rays=rays, seed=lens.seed, noise=False)[0].image.cpu().numpy()
-        aim = target / target.mean()
-        return relative_rms(comparison.registered(image / image.mean(), aim), aim), relative_rms(image, target)
+        return errors_of(lens, scaled(sent + known, guess.scale) + deviation(lens.field, guess.modes))
 
     draws = judged.found.draws(DRAWS)
     now, then = (np.array([errors(sent, guess) for guess in draws]) for sent in (lens.heights, heights))
@@ -160,6 +155,24 @@ def predicted(lens: Lens, judged: Judged, heights: Tensor) -> dict[str, Any]:
         "gain": both(gain),
         "moved_um": 1e3 * float((moved - moved.mean()).square().mean().sqrt()),
     }
+
+
+def errors_of(lens: Lens, part: Tensor) -> tuple[float, float]:
+    """Errors of the picture of a part of these heights, registered and in the frame of the screen, by the mean of two images with
+    rays of their own, without the noise that their difference shows: that of few rays is no error of a part."""
+    target = np.asarray(lens.target)
+    rays, aim = min(max(LEAST, EACH * target.size), MOST), target / target.mean()
+    images = [
+        retrace(lens.scene, lens.field, part, target, rays=rays, seed=lens.seed + k, noise=False)[0].image.cpu().numpy()
+        for k in range(2)
+    ]
+    a, b = (image / image.mean() for image in images)
+    image, noise = 0.5 * (a + b), 0.25 * float(np.square(a - b).mean())
+
+    def without_noise(seen: np.ndarray) -> float:
+        return math.sqrt(max(0.0, relative_rms(seen, aim) ** 2 - noise))
+
+    return without_noise(comparison.registered(image, aim)), without_noise(image)
 
 
 def refuse_uncertain(figures: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.errors import alternatives
+from caustic_cli.errors import InputError, alternatives
 from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.part import Part, part_of, turned
@@ -21,6 +21,7 @@ from caustic_cli.export.reading import Reading, Readings
 from caustic_cli.export.register import other, sides_of, with_stock
 from caustic_cli.export.supported import EXPORT, refuse
 from caustic_cli.io.heightmaps import beside
+from caustic_cli.optics import finishing
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.facets import FacetSurface
@@ -85,6 +86,8 @@ class Exporter:
         refuse(scene, format, script, mould)
         if format in AS_CUT and scene.lens.entrance is not None:
             return self._write_sides(path, format, scene, Milling(**(milling or {})), given)
+        if "pin" in (milling or {}):
+            raise InputError("⟨pin⟩ is of a lens with two free-form sides, which is turned over onto pins; this one has one side")
         part = part_of(format, scene, self.field, self.heights, mould, block)
         home = _home(format)
         writer = getattr(home, f"write_{format}")
@@ -267,7 +270,8 @@ def export(
         format: a name of FORMATS.
         output: file to write, None for the project's name here.
         script: of lighttools: also the script that rebuilds the scene.
-        given: samples (n, m) or tolerance, mm, of the sampled formats; mould, block; milling, a dictionary.
+        given: samples (n, m) or tolerance, mm, of the sampled formats; mould, block; milling, a dictionary; printer, mm, which is
+            else that of the project's finish.
         force: replace files not made by this program, and repeat what is up to date.
         at: parameter values for a network that was trained over ranges, "throw=300"; also part of the default file name.
 
@@ -281,6 +285,9 @@ def export(
     which = "" if at is None else f"-{at.replace(' ', '').replace(',', '-').replace('=', '-')}"
     path = output or Path(opened.path.resolve().stem + which + FORMATS[format][0])
     written = files(path, exporter.scene, format, script)
+    printer = finishing.printer(opened.settings.lens.finish)
+    if printer is not None and "printer" in getattr(_home(format), "MORE", ()):
+        given = {"printer": printer} | given
     values = ({"at": at} if at is not None else {}) | ({"most": exporter.most} if exporter.most != MOST_BYTES else {})
     made = Outputs(opened, "export", {"format": format, "script": script, **values, **given}, written)
     if not force and (found := made.found()):

@@ -297,7 +297,7 @@ def judge(lens: Lens, taken: Sequence[Shot], say: Reporter) -> Judged:
         image, screen = model.image(own.target.shape) if wave is None else wave, own.scene.screen
         places = {"marks": shot.marks, "corners": shot.corners}
         seen = registration.register(shot.path, shot.codes, image, screen.half_size, screen.shift, **places)
-        observations.append(inference.Observation(model, seen.on_screen, seen.camera.covariance))
+        observations.append(inference.Observation(model, seen.for_model, seen.camera.covariance))
         photographs.append(seen), lenses.append(own), expected.append(image)
     with say.progress(None) as show:
         found = inference.infer(observations, show=lambda done, whole: show("photograph", "inferring the part", done, whole))

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
@@ -148,17 +149,36 @@ def _on_screen(p: np.ndarray, covariance: np.ndarray, size: tuple[int, int]) -> 
 
 
 def rectified(
-    photograph: np.ndarray, camera: Camera, resolution: tuple[int, int], window: tuple = ((-1.0, 1.0), (-1.0, 1.0))
+    photograph: np.ndarray,
+    camera: Camera,
+    resolution: tuple[int, int],
+    window: tuple = ((-1.0, 1.0), (-1.0, 1.0)),
+    *,
+    splined: bool = False,
 ) -> np.ndarray:
     """A photograph (rows, columns) in screen coordinates: (n, m) means over the pixels of a window of the screen, its lower and
-    upper X and Y, [i, j]; NaN beyond the edges of the photograph."""
+    upper X and Y, [i, j], or means weighted by the quadratic B-spline about each; NaN beyond the edges of the photograph."""
     (n, m), ((left, right), (low, high)) = resolution, window
     x, y = np.array([left, right, left, right]), np.array([low, low, high, high])
     a, b = camera.project(x, y)
     along = max(np.hypot(np.diff(a)[[0, 2]], np.diff(b)[[0, 2]]).max() / n, 1.0)
-    times = int(min(MOST, max(2, np.ceil(1.5 * along))))
-    fine = [p + (q - p) * (np.arange(times * r) + 0.5) / (times * r) for r, (p, q) in zip((n, m), window, strict=True)]
+    times, beyond = int(min(MOST, max(2, np.ceil(1.5 * along)))), int(splined)
+    fine = [
+        p + (q - p) * ((np.arange(times * (r + 2 * beyond)) + 0.5) / times - beyond) / r
+        for r, (p, q) in zip((n, m), window, strict=True)
+    ]
     x, y = np.meshgrid(*fine, indexing="ij")
     a, b = camera.project(x.ravel(), y.ravel())
-    values = map_coordinates(photograph, [b, a], order=1, mode="constant", cval=np.nan).reshape(n, times, m, times)
-    return values.mean((1, 3))
+    values = map_coordinates(photograph, [b, a], order=1, mode="constant", cval=np.nan).reshape(x.shape)
+    weights = _weights(times, splined)
+    along_x = sliding_window_view(values, len(weights), 0)[::times] @ weights
+    return sliding_window_view(along_x, len(weights), 1)[:, ::times] @ weights
+
+
+def _weights(times: int, splined: bool) -> np.ndarray:
+    """Weights of points, `times` for each pixel, in the mean over a pixel or about it."""
+    if not splined:
+        return np.full(times, 1.0 / times)
+    t = np.abs((np.arange(3 * times) + 0.5) / times - 1.5)
+    weights = np.where(t < 0.5, 0.75 - t * t, 0.5 * (1.5 - t) ** 2)
+    return weights / weights.sum()

