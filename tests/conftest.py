@@ -84,13 +84,11 @@ def pytest_sessionstart(session):
         ahead.compile_behind(ahead.PARTS)
 
 
-#: Tests of ten to forty seconds each, together two and a half minutes on two cores, that run with --long: of what seldom changes or
+#: Tests of five to forty seconds each, together four minutes on two cores, that run with --long: of what seldom changes or
 #: is tested elsewhere in smaller pieces.
 LONG = (
     "faults/test_kill.py",
     "test_a_design_killed_before_its_first_checkpoint_is_begun_anew[index]",
-    "test_kernels_in_the_simulator",
-    "test_kernels_through_the_compiler",
     "test_a_flat_mirror_excludes_nothing_that_a_lens_has_by_itself",
     "test_surfaces_of_two_lenses_are_shaped_together",
     "test_the_commands_of_a_chapter_run[5-accuracy]",
@@ -113,6 +111,11 @@ LONG = (
     "test_corners_and_the_picture_itself_find_the_screen_too",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.001-0.05-1]",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.003-0.25-3]",
+    "test_one_photograph_is_enough_for_a_smooth_form_error[0.003-0.05-2]",
+    "test_draws_have_the_covariance_of_the_fit",
+    "test_both_sides_have_form_errors_of_their_own",
+    "test_steps_are_those_of_a_true_staircase[printer1]",
+    "test_steps_are_those_of_a_true_staircase[printer2]",
 )
 
 
