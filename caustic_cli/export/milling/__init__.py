@@ -23,7 +23,7 @@ DIALECTS = ("mm", "inch", "simple", "simple-inch")
 #: Largest concave curvature, over that of the tool, for which the step-over is reduced; beyond, material is left in any case.
 FITS = 0.75
 #: Default scallops, mm, by path.
-SCALLOPS = {"raster": 1e-3, TURNING: 1e-5}
+SCALLOPS = {"raster": 1e-3, TURNING: 1e-4}
 #: Default least stock above the highest point, mm.
 FACING = 0.1
 
@@ -40,7 +40,7 @@ class Milling:
     tool_radius: float = _setting(2.0, "Radius of the ball that finishes, or of the nose of a tool that turns.", "mm", 1e3)
     scallop: float | None = _setting(
         None,
-        "Height of the scallops that finishing leaves, at most; sets the step-over.  [default: 0.001, of turning 0.00001]",
+        "Height of the scallops that finishing leaves, at most; sets the step-over.  [default: 0.001, of turning 0.0001]",
         "mm",
         10.0,
     )
