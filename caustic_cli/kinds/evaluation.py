@@ -136,11 +136,8 @@ class LensEvaluation:
         # rays of a lens that was refined on its wave image say nothing of it once there is none
         lost = figures["no_wave_image"] if self.light is None and light is not None else ""
         if lost or _worse(figures, initial):
-            why = (
-                f"it has no wave image any more, and its start is kept: {lost}"
-                if lost
-                else (f"its start was better and is kept: {_difference(figures, initial)}")
-            )
+            better = f"its start was better and is kept: {_difference(figures, initial)}"
+            why = f"it has no wave image any more, and its start is kept: {lost}" if lost else better
             self.state = replace(self.designer.showing(state, heights), reason=f"{state.reason}; {why}")
             self.exposure, retraced = self.rays(heights)
             figures, self.light = initial | retraced, light

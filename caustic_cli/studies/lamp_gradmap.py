@@ -9,6 +9,7 @@ so that only the few within it are traced again with tangents.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -27,94 +28,82 @@ from caustic_cli.studies.gradmap import Comparison, in_support, refuse_steps
 STEP = 1e-8
 
 
-def lamp_gradient(
-    lamp: Lamp,
-    goal: Goal,
-    field: PolarField,
-    values: Tensor,
-    control: tuple[int, int],
-    screen: Screen,
-    filter: Filter,
-    rays: int,
-    seed: int,
-) -> Tensor:
-    """Change of the image by a control value of the outer surface: (n_x, n_y) float64, parts of the chip's light per mm.
+@dataclass(frozen=True)
+class LampImage:
+    """The image of a lamp as a function of control values.
 
     Args:
-        control: (i, j) of the net, along u and v.
-        screen: pixels of the target, in its unit.
-        filter: gaussian or cosine, of size 3 or more along both axes.
-        rays: about; those of one lamp of an array, without what is reflected.
-
-    Raises:
-        InputError: no such control value, or a filter without a derivative.
+        values: of all surfaces; screen: pixels of the target, in its unit; filter: gaussian or cosine, of size 3 or more along both
+            axes; rays: about; those of one lamp of an array, without what is reflected.
     """
-    refuse_steps(filter)
-    direction, total = _direction(field, values, control), torch.zeros(screen.resolution, dtype=torch.float64)
-    for few in _under(lamp, field, values, control, rays, seed):
-        with forward_ad.dual_level():
-            image = _image(lamp, goal, field, forward_ad.make_dual(values, direction), few, screen, filter)
-            tangent = forward_ad.unpack_dual(image).tangent
-            total += 0.0 if tangent is None else tangent
-    return total
 
+    lamp: Lamp
+    goal: Goal
+    field: PolarField
+    values: Tensor
+    screen: Screen
+    filter: Filter
+    rays: int
+    seed: int
 
-def compare_lamp(
-    gradient: Tensor,
-    lamp: Lamp,
-    goal: Goal,
-    field: PolarField,
-    values: Tensor,
-    control: tuple[int, int],
-    screen: Screen,
-    filter: Filter,
-    rays: int,
-    seed: int,
-) -> Comparison:
-    """How far `gradient` (of `lamp_gradient` with the same arguments) is from central differences of images of all rays."""
-    step = STEP * float(values.mean())
-    direction, difference = _direction(field, values, control), torch.zeros_like(gradient)
-    above, below = values + step * direction, values - step * direction
-    distance = float((above - below)[direction > 0])
-    with torch.no_grad():
-        for part in emissions(lamp.chip, rays, seed):
-            one, other = (_image(lamp, goal, field, net, part, screen, filter) for net in (above, below))
-            difference += (one - other) / distance
-    error, scale = gradient - difference, float(difference.norm())
-    return Comparison(float(error.norm()) / scale if scale > 0 else None, float(error.abs().max()), step)
+    def derivative(self, control: tuple[int, int]) -> Tensor:
+        """Change of the image by a control value (i, j), along u and v, of the outer surface: (n_x, n_y) float64, parts of the
+        chip's light per mm.
 
+        Raises:
+            InputError: no such control value, or a filter without a derivative.
+        """
+        refuse_steps(self.filter)
+        direction, total = self._direction(control), torch.zeros(self.screen.resolution, dtype=torch.float64)
+        for few in self._under(control):
+            with forward_ad.dual_level():
+                image = self._of(forward_ad.make_dual(self.values, direction), few)
+                tangent = forward_ad.unpack_dual(image).tangent
+                total += 0.0 if tangent is None else tangent
+        return total
 
-def _image(lamp: Lamp, goal: Goal, field: PolarField, values: Tensor, rays: ChipRays, screen: Screen, filter: Filter) -> Tensor:
-    """The image of some rays."""
-    light = through(lamp, field, rays, values)
-    x, y, ahead = land(goal, light)
-    arriving = torch.where(ahead, light.power, torch.zeros_like(light.power))
-    return backend_for("cpu").splat(x, y, arriving, screen, filter)[0]
+    def compared(self, derivative: Tensor, control: tuple[int, int]) -> Comparison:
+        """How far a `derivative` is from central differences of images of all rays."""
+        step = STEP * float(self.values.mean())
+        direction, difference = self._direction(control), torch.zeros_like(derivative)
+        above, below = self.values + step * direction, self.values - step * direction
+        distance = float((above - below)[direction > 0])
+        with torch.no_grad():
+            for part in emissions(self.lamp.chip, self.rays, self.seed):
+                difference += (self._of(above, part) - self._of(below, part)) / distance
+        error, scale = derivative - difference, float(difference.norm())
+        return Comparison(float(error.norm()) / scale if scale > 0 else None, float(error.abs().max()), step)
 
+    def _of(self, values: Tensor, rays: ChipRays) -> Tensor:
+        """The image of some rays."""
+        light = through(self.lamp, self.field, rays, values)
+        x, y, ahead = land(self.goal, light)
+        arriving = torch.where(ahead, light.power, torch.zeros_like(light.power))
+        return backend_for("cpu").splat(x, y, arriving, self.screen, self.filter)[0]
 
-def _direction(field: PolarField, values: Tensor, control: tuple[int, int]) -> Tensor:
-    """The unit net, 1 at the control value of the outer surface, of the shape of all values.
+    def _direction(self, control: tuple[int, int]) -> Tensor:
+        """The unit net, 1 at the control value of the outer surface, of the shape of all values.
 
-    Raises:
-        InputError: there is no such value.
-    """
-    if not all(0 <= k < n for k, n in zip(control, field.shape, strict=True)):
-        raise InputError(
-            f"the control point of a lamp must be I,J with I 0 to {field.shape[0] - 1} and J 0 to {field.shape[1] - 1}, got"
-            f" {control[0]},{control[1]}"
-        )
-    unit = torch.zeros_like(values)
-    sides(unit)[1][control] = 1.0
-    return unit
+        Raises:
+            InputError: there is no such value.
+        """
+        shape = self.field.shape
+        if not all(0 <= k < n for k, n in zip(control, shape, strict=True)):
+            raise InputError(
+                f"the control point of a lamp must be I,J with I 0 to {shape[0] - 1} and J 0 to {shape[1] - 1}, got"
+                f" {control[0]},{control[1]}"
+            )
+        unit = torch.zeros_like(self.values)
+        sides(unit)[1][control] = 1.0
+        return unit
 
-
-@torch.no_grad()
-def _under(lamp: Lamp, field: PolarField, values: Tensor, control: tuple[int, int], rays: int, seed: int) -> Iterator[ChipRays]:
-    """Those of the rays that meet the outer surface in the support of a basis function."""
-    for part in emissions(lamp.chip, rays, seed):
-        at = stereographic(*through(lamp, field, part, values).point)
-        in_u, in_v = in_support(field.net, control, *(0.5 * (c + 1.0) for c in at))
-        under = in_u & in_v
-        if bool(under.any()):
-            origin, way = (tuple(c[under] for c in vector) for vector in (part.origin, part.direction))
-            yield ChipRays(origin, way, part.power[under])
+    @torch.no_grad()
+    def _under(self, control: tuple[int, int]) -> Iterator[ChipRays]:
+        """Those of the rays that meet the outer surface in the support of a basis function."""
+        for part in emissions(self.lamp.chip, self.rays, self.seed):
+            at = stereographic(*through(self.lamp, self.field, part, self.values).point)
+            in_u, in_v = in_support(self.field.net, control, *(0.5 * (c + 1.0) for c in at))
+            under = in_u & in_v
+            if bool(under.any()):
+                origin, way = (tuple(c[under] for c in vector) for vector in (part.origin, part.direction))
+                yield ChipRays(origin, way, part.power[under])

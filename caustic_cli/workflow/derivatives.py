@@ -94,35 +94,36 @@ class OfLens:
 class OfLamp:
     """Of the radius of a lamp's outer surface, as `OfLens`; on the pixels of its last stage."""
 
-    design: LampDesign
-    screen: Screen
-    filter: Filter
-    rays: int
-    seed: int
+    traced: lamp_gradmap.LampImage
 
     @classmethod
     def of(cls, path: Path, rays: int, seed: int | None, kind: str, size: Size, alpha: float | None) -> OfLamp:
         """Of a project, see the options of caustic gradmap."""
         project = Project.open(path)
-        design = LampDesign.of(project)
-        count = stages_of(design.lamp, current_effort())[-1][1][0]
-        screen = Screen(design.goal.size, resolution=pixels_of(design.goal, count))
-        return cls(design, screen, filter_from(kind, size, screen, alpha), rays, project.seed if seed is None else seed)
+        one = LampDesign.of(project)
+        count = stages_of(one.lamp, current_effort())[-1][1][0]
+        screen = Screen(one.goal.size, resolution=pixels_of(one.goal, count))
+        filter, seed = filter_from(kind, size, screen, alpha), project.seed if seed is None else seed
+        return cls(lamp_gradmap.LampImage(one.lamp, one.goal, one.field, one.values, screen, filter, rays, seed))
 
     @property
     def shape(self) -> Size:
-        return self.design.field.shape
+        return self.traced.field.shape
+
+    @property
+    def screen(self) -> Screen:
+        return self.traced.screen
+
+    @property
+    def rays(self) -> int:
+        return self.traced.rays
 
     @property
     def unit(self) -> str:
-        return self.design.goal.unit
+        return self.traced.goal.unit
 
     def image(self, control: Size) -> Tensor:
-        return lamp_gradmap.lamp_gradient(*self._of(control))
+        return self.traced.derivative(control)
 
     def compared(self, gradient: Tensor, control: Size) -> Comparison:
-        return lamp_gradmap.compare_lamp(gradient, *self._of(control))
-
-    def _of(self, control: Size) -> tuple[Any, ...]:
-        one = self.design
-        return one.lamp, one.goal, one.field, one.values, control, self.screen, self.filter, self.rays, self.seed
+        return self.traced.compared(gradient, control)

@@ -296,7 +296,8 @@ def export(
         )
         return found
     made.refuse_foreign(force)
-    found = exporter.write(path, format, script, **given)
+    with exporter.say.notify_if_slow(f"{path} takes long: a larger ⟨tolerance⟩, or ⟨scallop⟩ of a tool, takes less"):
+        found = exporter.write(path, format, script, **given)
     more = {"beside": [str(file) for file in written[1:]]} if len(written) > 1 else {}
     figures = {
         "file": str(path),

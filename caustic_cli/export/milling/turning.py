@@ -40,7 +40,6 @@ from caustic_cli.export.milling.paths import batches, with_heights
 from caustic_cli.export.part import Part
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
-from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 #: First moves of a turn, at least; samples of a knot span for the point of contact, at most so many; most iterations to it.
@@ -77,7 +76,7 @@ class Blank:
         """Heights, mm, and slopes at points (N,) mm."""
         rx, ry = self.field.half_size
         cx, cy = np.clip(x, -rx, rx), np.clip(y, -ry, ry)
-        z, gx, gy = (t.numpy() for t in self.field.at(self.heights, torch.from_numpy(cx), torch.from_numpy(cy), FIRST))
+        z, gx, gy = (t.numpy() for t in self.field.evaluate(self.heights, torch.from_numpy(cx), torch.from_numpy(cy)))
         out = np.flatnonzero((cx != x) | (cy != y))
         if len(out):
             found = self._beyond(*(c[out] for c in (x, y, cx, cy, z, gx, gy)))
@@ -87,8 +86,8 @@ class Blank:
 
     def _beyond(self, x, y, cx, cy, z, gx, gy) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """z(c) + exp(-|e| / L) g(c) . e for points c + e beyond the rectangle, and its slopes."""
-        second = self.field.at(self.heights, torch.from_numpy(cx), torch.from_numpy(cy), SECOND)
-        hxy = second[1].numpy()
+        (twist,) = self.field.at(self.heights, torch.from_numpy(cx), torch.from_numpy(cy), ((1, 1),))
+        hxy = twist.numpy()
         ex, ey = x - cx, y - cy
         far, rise = np.hypot(ex, ey), gx * ex + gy * ey
         w = np.exp(-far / self.span)
