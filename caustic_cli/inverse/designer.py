@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse import ranks
 from caustic_cli.inverse.lbfgs import UNFIT, curvature
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import Heights
 from caustic_cli.inverse.problem import Problem, Skipped
+from caustic_cli.optics import ranks
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 

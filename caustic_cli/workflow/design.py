@@ -22,9 +22,8 @@ import torch
 
 from caustic_cli import __version__
 from caustic_cli.config import settings
-from caustic_cli.config.settings import Given
+from caustic_cli.config.settings import Given, Settings
 from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
-from caustic_cli.inverse import ranks
 from caustic_cli.inverse.accuracy_cost import CostOfAccuracy, Start, as_table
 from caustic_cli.inverse.designer import Designer, InitialHeights, State
 from caustic_cli.inverse.reachability import largest_magnification
@@ -36,6 +35,7 @@ from caustic_cli.kinds import OneSurface, kind_of, problem_of
 from caustic_cli.kinds.evaluation import Evaluated
 from caustic_cli.kinds.surface import PLATE, WALL
 from caustic_cli.loading import OnDemand
+from caustic_cli.optics import ranks
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights, trace_arguments
 from caustic_cli.project import attachments, directory, uptodate
@@ -315,13 +315,16 @@ def _refuse_edited(project: Project, designer: Designer, state: State) -> None:
         )
 
 
-def follow(device: str) -> None:
-    """Main loop of all ranks but the first: run each design it sends, without reading or writing files."""
-    with _signals():  # handled by the first rank
-        while task := ranks.receive():
-            *parts, state, limit = task
-            project = Project(None, *parts)
-            Designer(problem_of(project, device)).run(state, iterations=project.settings.design["iterations"], time_limit=limit)
+def follow() -> None:
+    """Main loop of all ranks but the first, whose signals the first handles."""
+    with _signals():
+        ranks.serve()
+
+
+def _joined(settings: Settings, picture: Picture, state: State, limit: float, device: str) -> None:
+    """Run a design together with the first rank, without reading or writing files."""
+    problem = problem_of(Project(None, settings, picture), device)
+    Designer(problem).run(state, iterations=settings.design.iterations, time_limit=limit)
 
 
 def _on_cpu(state: State) -> State:
@@ -483,7 +486,7 @@ def _run(
         with say.progress(watch.total) as watch.show:
             watch.measure(state)
             records.keep(state)
-            ranks.send((project.settings, project.picture, _on_cpu(state), limit))
+            ranks.send(partial(_joined, project.settings, project.picture, _on_cpu(state), limit, problem.device))
             state = designer.run(
                 state,
                 iterations=chosen.iterations,
