@@ -451,9 +451,13 @@ class _Watch:
         _, _, loss, on_screen, _ = now.history[-1]
         self.show(name, f"loss {loss * grey(self.target).size:.4f}  on screen {on_screen:.1%}", now.total, self.total)
         self.movie.record(now, self.target, self.encoding, bool(stage.waves))
+        self.measure_if_due(now)
+        self.keep_if_due(now)
+
+    def measure_if_due(self, now: State) -> None:
+        """Measure the error of the lens if this iteration is one of those planned."""
         if now.total in self.cost.due:
             self.measure(now)
-        self.keep_if_due(now)
 
     def keep_if_due(self, now: State) -> None:
         """Write a checkpoint if the last one is old enough."""
@@ -484,7 +488,6 @@ def _run(
     prepare_report(project, designer)
     with announce_compilation(say, COMPILING), _signals(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
-            watch.measure(state)
             records.keep(state)
             ranks.send(partial(_joined, project.settings, project.picture, _on_cpu(state), limit, problem.device))
             state = designer.run(
@@ -493,6 +496,7 @@ def _run(
                 time_limit=limit,
                 stop=lambda: bool(asked) or watch.reaches(goal),
                 on_iteration=watch,
+                on_objective=watch.measure_if_due,
                 notice=say.say,
             )
             if not asked and watch.reaches(goal):
