@@ -108,8 +108,6 @@ class Ahead(NamedTuple):
 class OneSurface(Problem):
     """One free-form surface, on rays and on the wave image, under any source."""
 
-    #: Why the optimisation cannot be recorded or resumed; "" where it can.
-    no_movie = no_resume = ""
     #: Whether the optimisation is that of the stage loop; otherwise the kind brings its own, `iterate`.
     in_stages = True
     #: Whether the thickness and the range of the heights may be adapted to the initial surface.
