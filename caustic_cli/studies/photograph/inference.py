@@ -11,9 +11,9 @@ Notation
 
 A, p and q are those of the largest evidence (MacKay, Bayesian interpolation, Neural Computation 4, 1992), with all other unknowns
 integrated over.  The response of the camera is fitted alone before every level; jointly with the rest it follows too slowly.
-Levels go from coarse pixels and few modes to fine pixels and as many modes as the prior asks for.  The fits on the finest pixels are
-without those of which a part is saturated: the mean of what was cut off is not the mean of the light.  The camera is known from its
-marks up to a covariance, which is its prior.
+Levels go from coarse pixels and few modes to fine pixels and as many modes as the prior asks for.  The finest leave out pixels of
+which a part is saturated: the mean of what was cut off is not the mean of the light.  The camera is known from its marks up to a
+covariance, which is its prior.
 """
 
 from __future__ import annotations

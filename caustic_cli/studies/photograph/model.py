@@ -13,8 +13,9 @@ Notation
 
 Rays lie on a regular lattice and are traced by the tracer of the project.  To first order a ray's landing point depends on the
 surface through height and slope where it leaves: three traces, of a surface raised and tilted a little, give the derivatives with
-respect to every mode.  The image itself is of more rays than its derivatives.  The image is a sum of quadratic B-splines (3 x 3 pixels) of the landing points, blurred by a Gaussian, and
-that of an extended source its convolution with the image of that source by the middle of the lens.
+respect to every mode.  The image, on the finest pixels of more rays than its derivatives, is a sum of quadratic B-splines (3 x 3
+pixels) of the landing points, blurred by a Gaussian, and that of an extended source its convolution with the image of that source
+by the middle of the lens.
 """
 
 from __future__ import annotations
