@@ -68,7 +68,7 @@ SAMPLES = 33
 FIRST = (3e-3, 3.0, 2.0)
 #: Least standard deviation of a code: of 8 bits.
 ROUNDING = 1.0 / 255.0 / np.sqrt(12.0)
-#: Most pixels over which misses count as correlated: those of a model that does not fit yet are correlated widely.
+#: Most pixels over which misses count as correlated in a fit: those of a model that does not fit yet are correlated widely.
 FEW = 9.0
 #: Blocks along the longer side over whose pixels misses are summed for the covariance, of 8 pixels each on the last grid.
 BLOCKS = 16
@@ -306,8 +306,8 @@ class _Seen:
         """r, 0 where it is not known."""
         return np.where(self.known, self.seen - prediction.codes, 0.0)
 
-    def estimate(self, prediction: Prediction) -> None:
-        """sigma from the misses of a prediction."""
+    def estimate(self, prediction: Prediction, most: float = FEW) -> None:
+        """sigma from the misses of a prediction, which count as correlated over so many pixels at most."""
         misses = self.misses(prediction)
         spectrum = np.abs(np.fft.rfft2(misses, [2 * n for n in misses.shape])) ** 2
         along = np.fft.irfft2(spectrum)[: misses.shape[0] // 2, : misses.shape[1] // 2]
@@ -316,7 +316,7 @@ class _Seen:
         lengths = [
             1.0 + 2.0 * line[1 : 1 + int(np.argmax(np.append(line[1:], 0.0) < 0.1))].sum() for line in (along[:, 0], along[0])
         ]
-        self.correlated = float(np.clip(lengths[0] * lengths[1], 1.0, FEW))
+        self.correlated = float(np.clip(lengths[0] * lengths[1], 1.0, most))
         size = float(np.sqrt((misses**2).sum() / max(self.known.sum(), 1)))
         self.sigma = max(size, ROUNDING) * np.sqrt(self.correlated)
 
@@ -537,7 +537,7 @@ class _Fit:
         """The inference at a guess."""
         predictions = self.predictions(self.traced(guess))
         for one, prediction in zip(self.seen, predictions, strict=True):
-            one.estimate(prediction)
+            one.estimate(prediction, np.inf)
         normal, pull = self._normal(predictions)
         _, _, (factor, unit) = self._solve(guess, normal, pull, prior)
         covariance = cho_solve(factor, np.eye(len(unit)))
