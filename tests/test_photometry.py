@@ -1,6 +1,7 @@
 """Photometric files: symmetry, intensities between their angles, a second reader, and targets of lamps."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,58 @@ def test_another_program_reads_the_same_of_lm_63():
     read = reader.ies_to_ldt(Path("a.ies"))
     np.testing.assert_allclose(np.array(read.intensities) * 2.5, light.values, rtol=1e-6, atol=1e-5)
     assert read.header.g_angles == ANGLES.tolist() and read.header.lamp_flux == [2500.0]
+
+
+def strictly_lm63(text):
+    """Planes, angles and intensities of a file of LM-63-2019, by the clauses of the standard and nothing but them."""
+    assert text.isascii() and text.endswith("\r\n") and "\n" not in text.replace("\r\n", "")
+    lines = text.split("\r\n")[:-1]
+    assert lines[0] == "IES:LM-63-2019" and all(len(line) <= 256 for line in lines)
+    tilt = lines.index("TILT=NONE")
+    keywords = [re.fullmatch(r"\[([A-Z0-9_]+)\] ?(.*)", line) for line in lines[1:tilt]]
+    assert all(keywords) and {"TEST", "TESTLAB", "ISSUEDATE", "MANUFAC"} <= {found[1] for found in keywords}
+    lamps, lumens, factor, vertical, horizontal, kind, unit, *size = lines[tilt + 1].split()
+    assert (lamps, kind) == ("1", "1") and unit in "12" and len(size) == 3 and float(lumens) > 0
+    ballast, file_type, watts = lines[tilt + 2].split()
+    assert float(ballast) == 1.0 and float(watts) >= 0 and re.fullmatch(r"1\.[01]{5}", file_type)  # 4.1.2: how it was made
+    numbers = [float(word) for line in lines[tilt + 3 :] for word in line.split()]
+    n, m = int(vertical), int(horizontal)
+    gamma, plane, values = np.split(np.array(numbers), [n, n + m])
+    assert len(values) == n * m and (np.diff(gamma) > 0).all() and (np.diff(plane) > 0).all()
+    assert gamma[0] in (0.0, 90.0) and gamma[-1] in (90.0, 180.0) and plane[0] == 0.0 and plane[-1] in (0.0, 90.0, 180.0, 360.0)
+    return plane, gamma, float(factor) * values.reshape(m, n), float(lumens)
+
+
+def strictly_eulumdat(text):
+    """The same of EULUMDAT, with the widths of its fields, of a file without symmetry and with one set of lamps."""
+    lines = text.split("\r\n")[:-1]
+    widths = [78, 1, 1, 2, 5, 2, 5, 78, 78, 78, 8, 78, *[4] * 7, *[4] * 4, 1, 6, 6]
+    assert all(len(line) <= most for line, most in zip(lines, widths, strict=False) if not line.replace(".", "").isdigit())
+    m, step, n, fine = int(lines[3]), float(lines[4]), int(lines[5]), float(lines[6])
+    assert lines[1:3] == ["3", "0"] and m * step == 360.0 and (n - 1) * fine == 180.0 and lines[25] == "1"
+    assert len(lines) == 42 + m + n + m * n and all(len(line) <= 12 for line in lines[32:])
+    numbers = np.array([float(line) for line in lines[42:]])
+    plane, gamma, values = np.split(numbers, [m, m + n])
+    np.testing.assert_allclose(plane, step * np.arange(m))
+    np.testing.assert_allclose(gamma, fine * np.arange(n))
+    lumens = float(lines[28])
+    return plane, gamma, values.reshape(m, n) * lumens / 1000.0, float(lines[22]), lumens
+
+
+def test_files_are_of_their_formats_to_the_letter():
+    """By readers that know the formats, not what writes them, and keep nothing that these do not have."""
+    light = light_of(lopsided)._replace(lumens=2500.0, name="a lamp", diameter=30.0, height=12.5)
+    write_ies(Path("a.ies"), light)
+    write_ldt(Path("a.ldt"), light)
+    plane, gamma, values, lumens = strictly_lm63(Path("a.ies").read_bytes().decode("ascii"))
+    np.testing.assert_allclose(values, np.concatenate([light.values, light.values[:1]]), rtol=1e-6, atol=1e-5)
+    assert lumens == 2500.0 and plane.tolist() == [*PLANES, 360.0] and gamma.tolist() == ANGLES.tolist()
+    _, _, values, ratio, lumens = strictly_eulumdat(Path("a.ldt").read_bytes().decode("latin-1"))
+    np.testing.assert_allclose(values, light.values, rtol=1e-6, atol=1e-5)
+    fine = np.linspace(0.0, np.pi, 20_001)  # light output ratio: the flux by the trapezoidal rule over that of the lamps
+    over = np.interp(fine, np.radians(ANGLES), light.values.mean(0)) * np.sin(fine)
+    flux = 2.0 * np.pi * float(0.5 * (over[1:] + over[:-1]).sum() * (fine[1] - fine[0]))
+    assert lumens == 2500.0 and ratio == pytest.approx(100.0 * flux / lumens, rel=5e-3)
 
 
 # Targets

@@ -131,9 +131,9 @@ def _draw_section(axis: Axes, lamp: Lamp, field: PolarField, values: Tensor) -> 
     """Sections of the lens along x and along y."""
     rho = torch.linspace(-1.0, 1.0, POINTS, dtype=torch.float64)
     zero = torch.zeros_like(rho)
-    for surface, (own, net) in zip(("outer", "inner"), surfaces_of(lamp, field, values), strict=True):
+    for surface, side in zip(("outer", "inner"), surfaces_of(lamp, field, values), strict=True):
         for name, at, colour in (("x", (rho, zero), COLOURS[0]), ("y", (zero, rho), COLOURS[1])):
-            x, y, z = own.points(net, *at)
+            x, y, z = side.points(*at)
             label = f"along {name}" if surface == "outer" else None
             axis.plot((x if name == "x" else y).numpy(), z.numpy(), color=colour, label=label)
     axis.plot([-0.5 * lamp.chip.size[0], 0.5 * lamp.chip.size[0]], [0.0, 0.0], color="black", linewidth=4.0)

@@ -268,7 +268,7 @@ def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
     if lamp.count > 1 and not goal.far:
         width, height = lamp.places.max(0) - lamp.places.min(0)
         yield f"the pictures of the lamps lie within {width:g} x {height:g} mm of each other"
-    if lamp.surfaces == 2:
+    if lamp.surfaces == 2 or lamp.flat is not None:
         return
     most = math.degrees(math.acos(1.0 / lamp.index))
     if (needed := 90.0 - goal.nearest_edge) > most:
