@@ -50,15 +50,14 @@ def angles_of(light: Photometry, projection: str = "latitude") -> tuple[float, f
 
 
 def edges_of(light: Photometry) -> str:
-    """What is lost of a file with sharp edges, "" for one without."""
+    """What is uncertain of a file with sharp edges, "" for one without."""
     ahead = light.values[:, light.angles < 90.0]
     if not np.abs(np.diff(ahead, axis=1)).max(initial=0.0) > EDGE * ahead.max(initial=0.0):
         return ""
     step = float(light.angles[1] - light.angles[0])
     return (
-        f"has sharp edges, within one of its steps of {step:g} degrees, and does not say where: they become steps at the borders of"
-        " its cells, and the file of the lamp's light differs by some 2 %; the picture itself as target, over ⟨+lamp.angles⟩, keeps"
-        " them"
+        f"has sharp edges, within one of its steps of {step:g} degrees: where they run is estimated from its cells, and the file of"
+        " the lamp's light differs by some 1 %; the picture itself as target, over ⟨+lamp.angles⟩, keeps them"
     )
 
 

@@ -118,7 +118,8 @@ def row(name: str, picture: Path | str, quality: str, folder: Path, out: Path) -
     words, _, options = LENSES[name]
     project = folder / f"{name}.caustic"
     began = time.monotonic()
-    said = caustic("design", picture, "--quality", quality, *options.split(), "-o", project)
+    how = options.split() + (["--quality", quality] if quality != "standard" else [])  # which a lamp has not
+    said = caustic("design", picture, *how, "-o", project)
     seconds = time.monotonic() - began
     sharp = caustic("render", project, "--rays", "3.2e7" if said.get("least_relative_rms") is None else "8e6")
     strip(project, out / f"{name}.png")
