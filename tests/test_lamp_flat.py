@@ -16,6 +16,7 @@ from caustic_cli.inverse.lamp import design_lamp, field_of, initial_lamp, pixels
 from caustic_cli.optics.lamp import PointGrid, from_centre, land, least_wall, surfaces_of, through, through_point
 from caustic_cli.optics.lamp_side import Roof
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
+from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.studies.lamp import lamp_figures
 
@@ -80,6 +81,16 @@ def test_light_below_a_plane_is_lambertian_over_the_cone_of_total_reflection():
         + 8.0 * n**4 * (n**4 + 1.0) / ((n**2 + 1.0) * (n**4 - 1.0) ** 2) * math.log(n)
     )
     assert reflected == pytest.approx(walsh, abs=2e-4)
+
+
+@pytest.mark.parametrize("table", [None, Distribution((0.0, 40.0, 90.0), (1.0, 0.6, 0.3))])
+def test_the_limit_of_uncoated_surfaces_is_that_of_the_light_that_passes_the_plane(table):
+    lamp = replace(LAMP, chip=Chip(intensity=table))
+    light = through(lamp, FIELD, emit(lamp.chip, 100_000, 4), FIELD.sphere(12.0))
+    passed = 1.0 - float((light.lost["missed"] + light.lost["inner_fresnel"]).sum())
+    normal = 1.0 - ((LAMP.index - 1.0) / (LAMP.index + 1.0)) ** 2
+    assert lamp.uncoated_limit == pytest.approx(normal * passed, abs=3e-4)
+    assert lamp.uncoated_limit < Lamp().uncoated_limit - 0.02
 
 
 @pytest.mark.parametrize("chip", CHIPS)
