@@ -303,6 +303,20 @@ def test_a_photometric_file_symmetric_about_its_axis_is_a_distribution(write, tm
         parse_distribution(b"IES\nnothing", "led.ies")
 
 
+def test_an_edge_of_a_symmetric_file_may_run_between_its_angles(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    light = photometry(0.0)
+    values = np.where(light.angles < 45.0, 300.0, 0.0) * np.ones((4, 1))
+    values[:, 4] = [300.0, 200.0, 250.0, 100.0]  # the part of a cell that is lit, by some rays
+    write_ldt(Path("edge.ldt"), light._replace(values=values))
+    found = parse_distribution(Path("edge.ldt").read_bytes(), "edge.ldt")
+    assert found.values[4] == pytest.approx(212.5)
+    values[1, 2] = 200.0
+    write_ldt(Path("edge.ldt"), light._replace(values=values))
+    with pytest.raises(InputError, match="planes C differ by"):
+        parse_distribution(Path("edge.ldt").read_bytes(), "edge.ldt")
+
+
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

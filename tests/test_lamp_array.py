@@ -31,6 +31,7 @@ ARRAYS = {
     "row": (Lamp(base=2.0, array=(3, 1), pitch=(34.0, 34.0), flange=3.0), 12),
     "oblong": (Lamp(base=2.0, array=(2, 3), pitch=(34.0, 40.0)), 60),
     "square": (Lamp(base=1.0, array=(2, 2), pitch=(34.0, 34.0), flange=1.0), 64),
+    "flat": (Lamp(base=1.0, array=(2, 1), pitch=(34.0, 34.0), flat=0.5), 20),
 }
 
 
@@ -52,7 +53,7 @@ def test_the_mesh_is_one_closed_body_of_the_volume_of_lamps_and_board(name):
     assert len(seen) == len(edges) and all((b, a) in seen for a, b in seen)
     half = lamp.board
     opening = 0.5 * around * math.sin(2.0 * math.pi / around) * lamp.inner**2  # a polygon
-    own = volume(*lamp_mesh(Lamp(), FIELD, VALUES, (20, around)))
+    own = volume(*lamp_mesh(Lamp(flat=lamp.flat), FIELD, VALUES, (20, around)))
     assert volume(points, faces) == pytest.approx(lamp.count * own + lamp.base * (4.0 * half[0] * half[1] - lamp.count * opening))
     assert np.abs(points[:, :2]).max(0) == pytest.approx(half) and points[:, 2].min() == -lamp.base
 

@@ -25,6 +25,7 @@ from caustic_cli.export.lamp_step import nurbs, write_lamp_step
 from caustic_cli.inverse.lamp import pixels_of, wanted
 from caustic_cli.inverse.refractor_transport import source_directions
 from caustic_cli.optics.lamp import ChipRays, PointGrid, chip_grids, emissions, land, through
+from caustic_cli.optics.lamp_side import PolarSide
 from caustic_cli.optics.surfaces.polarfield import PolarField, direction_of
 from caustic_cli.project.project import Project
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
@@ -50,6 +51,8 @@ CASES = {
     "foot": (Lamp(base=1.5), ONE, 7, 12),
     "flange": (Lamp(base=1.0, flange=2.0), ONE, 8, 14),
     "two surfaces": (Lamp(surfaces=2, inner=3.0, base=1.5, flange=2.0), TWO, 8, 14),
+    "flat": (Lamp(inner=5.0, flat=0.8), ONE, 5, 8),
+    "flat, flange": (Lamp(inner=5.0, flat=0.8, base=1.0, flange=2.0), ONE, 8, 14),
 }
 
 
@@ -93,13 +96,15 @@ def evaluated(surface, u, v):
 def test_the_surfaces_of_a_step_file_are_those_of_the_lamp(case, tmp_path):
     lamp, values, *_ = CASES[case]
     write_lamp_step(tmp_path / "a.step", lamp, FIELD, values)
-    outer, inner = surfaces_in(read_step(tmp_path / "a.step"))
+    outer, *inner = surfaces_in(read_step(tmp_path / "a.step"))
     u, v = random_directions(2000)
     at = 0.5 * (u.numpy() + 1.0), 0.5 * (v.numpy() + 1.0)
     wanted = np.stack(FIELD.points(values if values.ndim == 2 else values[1], u, v), 1)
     assert np.abs(evaluated(outer, *at) - wanted).max() < 1e-12
-    inside = np.stack(FIELD.points(FIELD.sphere(lamp.inner) if values.ndim == 2 else values[0], u, v), 1)
-    assert np.abs(evaluated(inner, *at) - inside).max() < 1e-12
+    if lamp.flat is None:
+        inside = np.stack(FIELD.points(FIELD.sphere(lamp.inner) if values.ndim == 2 else values[0], u, v), 1)
+        assert np.abs(evaluated(inner[0], *at) - inside).max() < 1e-12
+    assert len(inner) == (lamp.flat is None)
     moved = np.stack(FIELD.points(1.001 * (values if values.ndim == 2 else values[1]), u, v), 1)
     assert np.abs(evaluated(outer, *at) - moved).max() > 1e-3
 
@@ -134,10 +139,11 @@ def test_step_in_opencascade(case, tmp_path):
     surfaces, mass = step_in_opencascade(tmp_path / "a.step")
     assert len(surfaces) == faces
     assert mass() == pytest.approx(volume(*lamp_mesh(lamp, FIELD, values, (200, 800))), rel=1e-4)
-    outer, inner = [s for s in surfaces if isinstance(s, Geom_BSplineSurface)]
+    outer, *inner = [s for s in surfaces if isinstance(s, Geom_BSplineSurface)]
+    assert len(inner) == (lamp.flat is None)
     u, v = random_directions(300)
     nets = (values, FIELD.sphere(lamp.inner)) if values.ndim == 2 else (values[1], values[0])
-    for surface, net in zip((outer, inner), nets, strict=True):
+    for surface, net in zip((outer, *inner), nets, strict=False):
         points = [surface.Value(0.5 * (a + 1.0), 0.5 * (b + 1.0)) for a, b in zip(u.tolist(), v.tolist(), strict=True)]
         seen = np.array([(p.X(), p.Y(), p.Z()) for p in points])
         assert np.abs(seen - np.stack(FIELD.points(net, u, v), 1)).max() < 1e-9
@@ -167,7 +173,15 @@ def test_a_foot_has_the_volume_of_its_cylinders():
     own, below, around = (volume(*lamp_mesh(lamp, FIELD, FIELD.sphere(10.0), (60, 960))) for lamp in (bare, foot, flange))
     assert below - own == pytest.approx(2.0 * math.pi * (10.0**2 - 4.0**2), rel=1e-4)
     assert around - own == pytest.approx(2.0 * math.pi * (13.0**2 - 4.0**2), rel=1e-4)
-    assert flange_radius(flange, FIELD, FIELD.sphere(10.0)) == pytest.approx(13.0)
+    assert flange_radius(flange, PolarSide(FIELD, FIELD.sphere(10.0))) == pytest.approx(13.0)
+
+
+@pytest.mark.parametrize("base", [0.0, 2.0])
+def test_the_cavity_below_a_flat_side_is_a_cylinder(base):
+    lamp = Lamp(flat=0.5, base=base)
+    solid, foot = 2.0 / 3.0 * math.pi * 10.0**3, base * math.pi * 10.0**2
+    expected = solid + foot - math.pi * 4.0**2 * (0.5 + base)
+    assert volume(*lamp_mesh(lamp, FIELD, FIELD.sphere(10.0), (60, 960))) == pytest.approx(expected, rel=2e-4)
 
 
 def test_a_flange_without_thickness_is_refused():

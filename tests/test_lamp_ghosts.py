@@ -13,7 +13,8 @@ from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.optics.interface import reflectance, refract
 from caustic_cli.optics.lamp import emissions, through
-from caustic_cli.optics.lamp_ghosts import ENDS, Sides, ghosts, refracted
+from caustic_cli.optics.lamp_ghosts import ENDS, ghosts, refracted
+from caustic_cli.optics.lamp_side import Hemisphere, PolarSide
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.studies.lamp import lamp_image
 
@@ -21,6 +22,7 @@ CASES = {
     "point": (Lamp(), ONE),
     "chip": (Lamp(Chip("rectangle", (1.0, 2.0), reflectance=0.8)), ONE),
     "two surfaces": (Lamp(Chip("disc", (1.0, 2.0), reflectance=0.5), surfaces=2, inner=3.0), TWO),
+    "flat": (Lamp(Chip("rectangle", (1.0, 2.0), reflectance=0.5), inner=5.0, flat=0.8), ONE),
 }
 
 
@@ -99,8 +101,9 @@ def test_a_path_within_the_lens_meets_the_inner_surface_where_it_lies():
     generator = torch.Generator().manual_seed(3)
     o = 12.0 * torch.nn.functional.normalize(torch.rand(400, 3, dtype=torch.float64, generator=generator) - 0.4, dim=1).abs()
     d = torch.nn.functional.normalize(4.4 * torch.rand(400, 3, dtype=torch.float64, generator=generator) - o, dim=1)
-    exact = Sides(lamp, FIELD, None, ONE).to_inner(o, d, torch.full((400,), 30.0, dtype=torch.float64))
-    searched = Sides(lamp, FIELD, FIELD.sphere(lamp.inner), ONE).to_inner(o, d, torch.full((400,), 30.0, dtype=torch.float64))
+    most = torch.full((400,), 30.0, dtype=torch.float64)
+    exact = Hemisphere(lamp.inner).met_from_glass(o, d, most)
+    searched = PolarSide(FIELD, FIELD.sphere(lamp.inner)).met_from_glass(o, d, most)
     met = torch.isfinite(exact) & torch.isfinite(searched)
     assert met.sum() > 100 and (torch.isfinite(exact) & ~met).float().mean() < 0.05  # short chords are missed
     torch.testing.assert_close(searched[met], exact[met], rtol=0, atol=1e-9)

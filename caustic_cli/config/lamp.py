@@ -141,7 +141,7 @@ def lamp_of(settings: Settings) -> Lamp:
         chip = Chip(shape, s.chip, table, reflectance=s.reflectance)
     pitch = s.pitch if "pitch" in s else (0.0, 0.0)
     solid = s.inner, s.radius, s.wall, s.surfaces, s.base, s.flange
-    return Lamp(chip, index_of(settings.lens), *solid, settings.lens.array, pitch, ghosts=s.reflectance > 0)
+    return Lamp(chip, index_of(settings.lens), *solid, settings.lens.array, pitch, s.flat, ghosts=s.reflectance > 0)
 
 
 def goal_of(settings: Settings) -> Goal:

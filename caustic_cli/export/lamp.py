@@ -1,8 +1,8 @@
 """The solid of a lamp as a closed triangle mesh: the outer surface, the inner one, and between them the ring of the base or
 a foot.
 
-Both surfaces are sampled on rings of the stereographic disc with equal steps of rho, between points at the same angles; the
-innermost ring is a single point on the axis.  Vertices run counter-clockwise seen from outside.
+Both surfaces are sampled on rings of the unit disc over which they lie, with equal steps of rho, between points at the same angles;
+the innermost ring is a single point on the axis.  Vertices run counter-clockwise seen from outside.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.export.mesh import walls
 from caustic_cli.optics.lamp import surfaces_of
+from caustic_cli.optics.lamp_side import InnerSide, PolarSide
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Lamp
 
@@ -65,15 +66,15 @@ def lamp_parts(lamp: Lamp, field: PolarField, values: Tensor, samples: tuple[int
     angle = np.tile(2.0 * math.pi * np.arange(around) / around, rings)
     u, v = (torch.from_numpy(np.concatenate([[0.0], rho * f(angle)])) for f in (np.cos, np.sin))
     both = surfaces_of(lamp, field, values)
-    outer, inner = (np.stack([c.numpy() for c in own.points(net, u, v)], 1) for own, net in both)
-    outward, inward = (np.stack([c.numpy() for c in own.normals(net, u, v)], 1) for own, net in both)
-    for points in (outer, inner):
-        points[-around:, 2] = 0.0  # the rim lies in the base plane, but for rounding
+    outer, inner = (np.stack([c.numpy() for c in side.points(u, v)], 1) for side in both)
+    outward, inward = (np.stack([c.numpy() for c in side.normals(u, v)], 1) for side in both)
+    for points, side in zip((outer, inner), both, strict=True):
+        points[-around:, 2] = side.rim  # the rim lies in a plane, but for rounding
     cap = _disc(rings, around)
     if lamp.count > 1:
         board = _board(lamp, outer[-around:], inner[-around:], angle[:around])
         return _tiled(lamp, (inner, cap[:, ::-1], -inward)), _tiled(lamp, (outer, cap, outward)), board
-    between = _foot(lamp, outer[-around:], inner[-around:], flange_radius(lamp, *both[0]), angle[:around])
+    between = _foot(lamp, outer[-around:], inner[-around:], flange_radius(lamp, both[0]), angle[:around])
     loops = [outer[-around:], *between, inner[-around:]]
     number = np.arange(len(loops) * around).reshape(len(loops), around)
     foot = np.concatenate([walls(one, other) for one, other in itertools.pairwise(number)])
@@ -111,7 +112,7 @@ def _board(lamp: Lamp, rim: np.ndarray, hole: np.ndarray, angle: np.ndarray) -> 
             ends.append((-edge - c if c <= -last else -0.5 * p, edge - c if c >= last else 0.5 * p))
         border, sides = _on_cell(ends, angle)
         at, start = np.array([x, y, 0.0]), len(points) * 5 * around
-        points.append(at + np.concatenate([rim, border, border - down, hole - down, hole]))
+        points.append(at + np.concatenate([rim, border, border - down, _opening(lamp, hole), hole]))
         top, outer, low, below, inner = number + start
         faces += [walls(top, outer), walls(low, below), walls(below, inner)]
         outside = np.array([abs(abs((x, y)[axis] + ends[axis][way]) - half[axis]) < 1e-9 * half[axis] for axis, way in sides])
@@ -145,28 +146,34 @@ def _on_cell(ends: Sequence[tuple[float, float]], angle: np.ndarray) -> tuple[np
     return np.append(border, np.zeros((len(angle), 1)), 1), sides
 
 
-def rim_points(field: PolarField, values: Tensor, angle: np.ndarray) -> np.ndarray:
-    """Points (N, 3) mm of a surface in the plane of the chip."""
-    x, y, _ = field.points(values, *(torch.from_numpy(f(angle)) for f in (np.cos, np.sin)))
-    return np.stack([x.numpy(), y.numpy(), np.zeros(len(angle))], 1)
+def rim_points(side: InnerSide, angle: np.ndarray) -> np.ndarray:
+    """Points (N, 2) mm of the rim of a side, seen along the axis."""
+    x, y, _ = side.points(*(torch.from_numpy(f(angle)) for f in (np.cos, np.sin)))
+    return np.stack([x.numpy(), y.numpy()], 1)
 
 
-def flange_radius(lamp: Lamp, field: PolarField, values: Tensor) -> float:
+def flange_radius(lamp: Lamp, outer: PolarSide) -> float:
     """Radius of the flange, mm: its width beyond the greatest radius of the rim."""
     angle = 2.0 * math.pi * np.arange(AROUND) / AROUND
-    return lamp.flange + float(np.linalg.norm(rim_points(field, values, angle), axis=1).max())
+    return lamp.flange + float(np.linalg.norm(rim_points(outer, angle), axis=1).max())
 
 
 def _foot(lamp: Lamp, rim: np.ndarray, hole: np.ndarray, radius: float, angle: np.ndarray) -> Iterator[np.ndarray]:
     """Loops of points (k, 3) between the rim of the outer surface and that of the inner one: a flange of this radius, lower edge,
     opening; at the angles of the rim."""
-    down = np.array([0.0, 0.0, lamp.base])
+    down, opening = np.array([0.0, 0.0, lamp.base]), _opening(lamp, hole)
     if lamp.flange > 0:
         rim = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
         yield rim
     if lamp.base > 0:
         yield rim - down
-        yield hole - down
+    if (opening != hole).any():
+        yield opening
+
+
+def _opening(lamp: Lamp, hole: np.ndarray) -> np.ndarray:
+    """The rim of the inner side (k, 3), projected onto the lower side of the base."""
+    return np.column_stack([hole[:, :2], np.full(len(hole), -lamp.base)])
 
 
 def _disc(rings: int, around: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 and `NAME-foot.ply` (binary, float64).
 
     inner, outer   smooth `dielectric`, meshes with their exact normals at the vertices
-    foot           black: light that returns to it is lost, as in a render
+    foot           black, with the side of a cavity below a flat inner side: light that meets it is lost, as in a render
     light          a Lambertian area of the size of the chip; of a point a disc of POINT times the radius of the inner side
     screen         white and diffuse at the target, or `plane_of` one in the far field; camera and integrator are those of `mitsuba`
 """

@@ -7,7 +7,7 @@ The surface P = r d over stereographic coordinates (u, v) has the homogeneous co
 of degree p + 2 along u and v where r is of degree p, and as smooth as r: splines over the knots of r with multiplicities raised by
 2 (Piegl and Tiller, The NURBS Book, 1997, 4.2).  Their control points are found by interpolation at the Greville abscissae, which
 is exact but for rounding.  The surface is trimmed at z = 0, the circle u^2 + v^2 = 1; that edge is interpolated, as of a round lens
-(`step.ring`).  Of the foot below it, the walls are the edges extruded along z, the flange is round.
+(`step.ring`).  A flat inner side is a plane.  Of the foot below it, the walls are the edges extruded along z, the flange is round.
 """
 
 from __future__ import annotations
@@ -38,9 +38,13 @@ from caustic_cli.export.step import (
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.lamp import surfaces_of
+from caustic_cli.optics.lamp_side import InnerSide
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene import Aperture, CircularAperture
 from caustic_cli.scene.lamp import Lamp
+
+#: Points of a round rim at first, over 8.
+ROUND = 4
 
 
 def nurbs(field: PolarField, values: Tensor) -> tuple[tuple[SplineSpace, SplineSpace], np.ndarray, np.ndarray]:
@@ -64,29 +68,31 @@ def _raised(space: SplineSpace) -> SplineSpace:
 
 def write_lamp_step(path: Path, lamp: Lamp, field: PolarField, values: Tensor) -> None:
     """Write the solid atomically; values: control values of r, mm, of one surface or two, see `optics.lamp.sides`."""
-    out, both, below = Entities(), surfaces_of(lamp, field, values), -lamp.base
-    splines, faces, rims, openings = [nurbs(*side) for side in both], [], [], []
+    out, (outer, inner), below = Entities(), surfaces_of(lamp, field, values), -lamp.base
+    splines = {side: nurbs(*side.spline) for side in (outer, inner) if side.spline is not None}
+    faces, rims, openings = [], [], []
     for place in lamp.places:
-        (outer, inner), (rim, hole) = (
-            [_surface(out, own, place) for own in splines],
-            [_rim(out, *side, 0.0, place) for side in both],
-        )
-        faces += [out.face(outer, out.bound(rim.edges)), out.face(inner, out.bound(turned(hole.edges)), along=False)]
+        rim, hole = (_rim(out, side, side.rim, place) for side in (outer, inner))
+        faces.append(out.face(_surface(out, splines[outer], place), out.bound(rim.edges)))
+        if inner in splines:
+            faces.append(out.face(_surface(out, splines[inner], place), out.bound(turned(hole.edges)), along=False))
+        else:
+            faces.append(_flat(out, inner.rim, hole, (), up=False))
         opening = hole
-        if lamp.base > 0:
-            opening = _rim(out, *both[1], below, place)
+        if below < inner.rim:
+            opening = _rim(out, inner, below, place)
             faces += walls(out, _extruded(out, opening), hole, opening, along=False)
         rims.append(rim)
         openings.append(opening)
     foot, shape = rims[0], OUTLINES[CircularAperture.name]
     if lamp.count > 1 or lamp.flange > 0:
-        around: Aperture = CircularAperture((flange_radius(lamp, *both[0]),) * 2)
+        around: Aperture = CircularAperture((flange_radius(lamp, outer),) * 2)
         if lamp.count > 1:
             shape, around = OUTLINES[Aperture.name], Aperture(lamp.board)
         edge, foot = shape.flat(out, around, 0.0), shape.flat(out, around, below)
         faces += [_flat(out, 0.0, edge, rims), *shape.walls(out, around, edge, foot)]
     elif lamp.base > 0:
-        foot = _rim(out, *both[0], below)
+        foot = _rim(out, outer, below)
         faces += walls(out, _extruded(out, foot), rims[0], foot)
     faces.append(_flat(out, below, foot, openings, up=False))
     product(out, [closed(out, faces)], ROUND_UNCERTAINTY)
@@ -108,13 +114,14 @@ def _surface(out: Entities, spline: tuple[tuple[SplineSpace, SplineSpace], np.nd
     )
 
 
-def _rim(out: Entities, field: PolarField, values: Tensor, z: float, place: Sequence[float] | np.ndarray = (0.0, 0.0)) -> Loop:
-    """The edge of a surface in the plane of the chip, or below it at z, of a lamp at a place (x, y)."""
+def _rim(out: Entities, side: InnerSide, z: float, place: Sequence[float] | np.ndarray = (0.0, 0.0)) -> Loop:
+    """The edge of a side, or below it at z, of a lamp at a place (x, y)."""
 
     def on(t: np.ndarray) -> np.ndarray:
-        return rim_points(field, values, t) + np.append(place, z)
+        return np.column_stack([rim_points(side, t) + place, np.full(len(t), z)])
 
-    return ring(out, on, 8 * max(field.shape))[0]
+    spans = (ROUND,) if side.spline is None else side.spline[0].shape
+    return ring(out, on, 8 * max(spans))[0]
 
 
 def _extruded(out: Entities, lower: Loop) -> list[str]:

@@ -25,10 +25,11 @@ from caustic_cli.effort import STANDARD, Effort
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.inverse.parametrisation import InverseLaplacian
-from caustic_cli.inverse.refractor_transport import CELLS, transported
+from caustic_cli.inverse.refractor_transport import CELLS, source_directions, transported
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.lamp import ChipRays, PointGrid, chip_grids, land, least_wall, through, through_point
+from caustic_cli.optics.lamp import ChipRays, PointGrid, chip_grids, from_centre, land, least_wall, through, through_point
+from caustic_cli.optics.lamp_side import Roof, inner_side
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene import Screen
@@ -55,6 +56,8 @@ LIMIT_POINTS, STIFF, SAFE, WITHIN = 8000, 10.0, 1.1, 1.02
 FOLD_POINTS, LEAST_AREA, FOLDED = 18_000, 0.2, 0.005
 #: Pairs of L-BFGS: 250 iterations with 100 reached what took 600 with 20 (one surface, 30 x 10 m from 8 m).
 MEMORY = 100
+#: Iterations of `Aimed`.
+AIMING = 60
 #: Radius of the first inner surface, a sphere, over its least one.
 BEGIN = 4.0 / 3.0
 
@@ -122,7 +125,7 @@ class LampObjective:
         self.weights = self.over(counted) / self.over(torch.ones_like(counted)) * float((self.over(lit) > 0).sum())
         self.splat = backend_for("cpu").splat
         brightest = float((target.numpy() / goal.shares(shape)).max())
-        self.limits = SurfaceLimits(lamp, goal, field, brightest) if lamp.surfaces == 2 else None
+        self.limits = limits_of(lamp, goal, field, brightest)
 
     def _interior(self, lamp: Lamp, shape: tuple[int, int]) -> Tensor:
         """1 on the pixels of the grown screen without a border of the target."""
@@ -177,6 +180,37 @@ class SurfaceLimits:
         return STIFF / count * total + self.folds.lack(values)
 
 
+class RoofLimits:
+    """Limits of a surface around a cavity with a flat roof, at the points of a grid: the wall, and the greatest radius."""
+
+    def __init__(self, lamp: Lamp, roof: Roof, field: PolarField):
+        self.lamp, self.roof, self.grids = lamp, roof, PointGrid.of(field, LIMIT_POINTS)
+
+    def lack(self, values: Tensor) -> Tensor:
+        """Sum of squares of what lacks, relative to each limit, per point, times STIFF."""
+        total, count, lamp = torch.zeros((), dtype=torch.float64), 0, self.lamp
+        for grid in self.grids:
+            point = grid.hits(values).point
+            lacks = (
+                1.0 - self.roof.clearance(point) / (SAFE * lamp.wall),
+                WITHIN * sum(c * c for c in point).sqrt() / lamp.radius - 1.0,
+            )
+            total = total + sum((lack.clamp_min(0.0) ** 2).sum() for lack in lacks)
+            count += len(point[0])
+        return STIFF / count * total
+
+
+Limits = SurfaceLimits | RoofLimits
+
+
+def limits_of(lamp: Lamp, goal: Goal, field: PolarField, brightest: float) -> Limits | None:
+    """The limits of a design, brightest: as of `Folds`; None of a hemisphere, whose light is the same around any scaled lens."""
+    if lamp.surfaces == 2:
+        return SurfaceLimits(lamp, goal, field, brightest)
+    side = inner_side(lamp, field, None)
+    return RoofLimits(lamp, side, field) if isinstance(side, Roof) else None
+
+
 class Folds:
     """Whether the light of the chip's centre folds, at the cells of a grid.
 
@@ -215,14 +249,17 @@ class Folds:
 
 
 def refine(
-    objective: LampObjective, values: Tensor, iterations: int, on_iteration: Callable[[int, float], None] = lambda k, loss: None
+    objective: LampObjective | Aimed,
+    values: Tensor,
+    iterations: int,
+    on_iteration: Callable[[int, float], None] = lambda k, loss: None,
 ) -> Tensor:
     """Control values after at most so many iterations of L-BFGS, in the coordinates of the inverse Laplacian, from initial ones.
 
     on_iteration: called with the number of iterations and the loss.
     """
-    # Of the logarithms of the control values, which keeps them positive; the ratio of two surfaces' radii affects the image.
-    spread = InverseLaplacian(values, 1.0 if values.ndim == 3 else 0.0)
+    # Of the logarithms of the control values, which keeps them positive; their mean affects the image, except around a hemisphere.
+    spread = InverseLaplacian(values, 0.0 if objective.limits is None else 1.0)
 
     def evaluate(x: Tensor) -> tuple[float, Tensor]:
         y = x.view(values.shape).clone().requires_grad_()
@@ -247,7 +284,32 @@ def initial_lamp(lamp: Lamp, goal: Goal, field: PolarField, picture: np.ndarray,
     pixels = pixels_of(goal, round(0.25 * math.pi * cells * cells))
     power = wanted(goal, picture, pixels).reshape(-1)
     lit = power > 0
-    return transported(field, directions_of(goal, pixels)[lit], power[lit], lamp.index, lamp.radius, cells, lamp.chip)
+    emitted, light = source_directions(cells, lamp.chip)
+    x, a = from_centre(lamp, field, emitted, light)
+    emitted, x, a = emitted[a > 0], x[a > 0], a[a > 0]
+    values, aims = transported(field, x, a, directions_of(goal, pixels)[lit], power[lit], lamp.index, lamp.radius)
+    limits = limits_of(replace(lamp, surfaces=1), goal, field, 1.0)
+    if limits is None:
+        return values
+    return refine(Aimed(replace(lamp, chip=lamp.chip.centre), field, limits, emitted, a, aims), values, AIMING)
+
+
+class Aimed:
+    """Mean square distance of the directions (N, 3) behind a lens of light that is emitted in given ones from those aimed at: the
+    transport takes light within the lens as if from the centre, from which that behind a plane does not come."""
+
+    def __init__(self, lamp: Lamp, field: PolarField, limits: Limits, emitted: Tensor, power: Tensor, aims: Tensor):
+        x, y, z = emitted.unbind(1)
+        zero = torch.zeros_like(x)
+        self.lamp, self.field, self.aims, self.limits = lamp, field, aims, limits
+        self.rays = ChipRays((zero, zero, zero), (x, y, z), power)
+
+    def __call__(self, values: Tensor) -> Tensor:
+        light = through(self.lamp, self.field, self.rays, values)
+        off = ((torch.stack(light.direction, 1) - self.aims) ** 2).sum(1)
+        lack = (1.0 - light.spare / MARGIN).clamp_min(0.0)
+        off = torch.where(light.power > 0, off, torch.zeros_like(off))
+        return (self.rays.power * (off + lack)).sum() + self.limits.lack(values)
 
 
 def field_of(effort: Effort, pixels: int | None = None) -> PolarField:
@@ -269,6 +331,8 @@ def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Lamp, tuple[int, int, in
     point = replace(lamp, chip=lamp.chip.centre)
     if lamp.surfaces == 2:
         found = [(replace(point, surfaces=1), effort.lamp_stages[0]), *((point, stage) for stage in effort.two_stages)]
+    elif lamp.flat is not None:  # the light is deflected twice as well, and its rays cost as much
+        found = [(point, stage) for stage in effort.two_stages]
     else:
         found = [(point, stage) for stage in effort.lamp_stages]
     if lamp.chip.shape == "point":
@@ -322,7 +386,7 @@ def design_lamp(
         values = refine(objective, values, iterations, partial(on_iteration, k))
         on_stage(k + 1, field, values)
     field, values = field_of(effort), refined(field, values, field_of(effort))
-    if lamp.surfaces == 1:  # the light of one that is a little smaller is the same
+    if lamp.surfaces == 1 and lamp.flat is None:  # the light of one that is a little smaller is the same
         values = min(1.0, lamp.radius / field.extent(values)[1]) * values
     refuse_thin(lamp, field, values)
     return values
@@ -341,6 +405,11 @@ def refuse_thin(lamp: Lamp, field: PolarField, values: Tensor) -> None:
         raise InputError(
             f"the two free-form surfaces come within {least:.3g} mm of each other, and ⟨lamp.wall⟩ must be {lamp.wall:g} mm: a"
             " larger ⟨+lamp.radius⟩ or a smaller ⟨+lamp.inner⟩ is needed"
+        )
+    if lamp.flat is not None:
+        raise InputError(
+            f"the free-form surface comes within {least:.3g} mm of the cavity of {lamp.inner:g} x {lamp.flat:g} mm, and the wall"
+            f" must be {lamp.wall:g} mm: a larger ⟨+lamp.radius⟩ or a smaller ⟨+lamp.inner⟩ is needed"
         )
     needed = lamp.radius * (lamp.inner + lamp.wall) / (lamp.inner + least)
     raise InputError(

@@ -73,20 +73,20 @@ def envelope(directions: Vectors, y: Tensor, b: Tensor, g: Tensor, e: float, ind
 
 
 def transported(
-    field: PolarField, y: Tensor, b: Tensor, index: float, radius: float, cells: int = CELLS, chip: Chip = LAMBERTIAN
-) -> Tensor:
-    """Control values (n, m) of r of the refractor that sends the light of a point of a chip to a target.
+    field: PolarField, x: Tensor, a: Tensor, y: Tensor, b: Tensor, index: float, radius: float
+) -> tuple[Tensor, Tensor]:
+    """Control values (n, m) of r of the refractor that sends the light of a point to a target, and the directions (N, 3), about
+    unit vectors, into which it sends that of each x: the mean of the plan of the transport.
 
     Args:
-        y, b: the target, as for `refractor_potential`.
+        x, a, y, b: the light within the lens and the target, as for `refractor_potential`.
         radius: greatest r towards the lit hemisphere, mm.
-        cells: of the source along u and v.
     """
-    x, a = source_directions(cells, chip)
     g, e = refractor_potential(x, a, y, b, index)
     u, v = field.net.control_xy()
     u, v = (c.reshape(-1) for c in torch.meshgrid(u, v, indexing="ij"))
     log_r = envelope(direction_of(u, v), y, b, g, e, index)
     values = field.net.interpolated((log_r - log_r.max()).exp().view(field.shape))
     lit = u * u + v * v <= 1.0
-    return radius / float(values.reshape(-1)[lit].max()) * values
+    plan = torch.softmax((g - torch.log1p(-(x @ y.T) / index)) / e + b.log(), 1)
+    return radius / float(values.reshape(-1)[lit].max()) * values, plan @ y

@@ -20,10 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from caustic_cli.optics.interface import reflectance, refract
+from caustic_cli.optics.lamp_side import InnerSide, PolarSide, inner_side
 from caustic_cli.optics.sampling import SOBOL_RAYS, Sample, Sampler, numbers
 from caustic_cli.optics.surfaces.polarfield import (
     PolarField,
@@ -45,8 +45,6 @@ from caustic_cli.scene.sources.rayset import RaySet
 LOSSES = ("inner_fresnel", "missed", "total_internal_reflection", "outer_fresnel")
 #: Least component along z of light that is followed to a plane: flatter light lands beyond 50 distances from the axis.
 SHALLOW = 0.02
-#: Points of a path within the lens at which it is tested against the inner surface.
-PROBES = 3
 #: Rays traced at a time.
 CHUNK = 1 << 17
 #: The constant a of a `PointGrid`, and its points over those of them within the circle.
@@ -223,30 +221,25 @@ def sides(values: Tensor) -> tuple[Tensor | None, Tensor]:
     return (None, values) if values.ndim == 2 else (values[0], values[1])
 
 
-def surfaces_of(lamp: Lamp, field: PolarField, values: Tensor) -> tuple[tuple[PolarField, Tensor], tuple[PolarField, Tensor]]:
-    """The outer and the inner surface with their control values."""
+def surfaces_of(lamp: Lamp, field: PolarField, values: Tensor) -> tuple[PolarSide, InnerSide]:
+    """The outer and the inner side."""
     inner, outer = sides(values.detach())
-    sphere = PolarField.uniform((4, 4))
-    return (field, outer), (sphere, sphere.sphere(lamp.inner)) if inner is None else (field, inner)
+    return PolarSide(field, outer), inner_side(lamp, field, inner)
 
 
 def least_wall(lamp: Lamp, field: PolarField, values: Tensor) -> float:
-    """Least distance of the two surfaces, mm; of two free-form ones between points of `PolarField.extent`; negative where the outer
-    one is nearer to the origin than the hemisphere."""
-    inner, outer = sides(values)
-    if inner is None:
-        return field.extent(outer)[0] - lamp.inner
-    one, other = (np.stack([c.numpy() for c in field.points(net.detach(), *field.sampled())], 1) for net in (inner, outer))
-    apart = float((np.linalg.norm(other, axis=1) - np.linalg.norm(one, axis=1)).min())  # along radii: an upper bound
-    return apart if apart <= 0 else min(apart, float(cKDTree(one).query(other, distance_upper_bound=apart)[0].min()))
+    """Least distance of the outer surface from the cavity, mm, see `InnerSide.wall`."""
+    inner, outer = sides(values.detach())
+    return inner_side(lamp, field, inner).wall(field, outer)
 
 
 def through_point(lamp: Lamp, field: PolarField, rays: PointGrid, values: Tensor) -> LampLight:
     """Light of a point at the origin through the lens; differentiable by the control values of r, see `sides`."""
     inner, outer = sides(values)
-    if inner is None:
+    side = inner_side(lamp, field, inner)
+    if side.undeflected:
         return _from_point(lamp, rays.hits(outer), rays.power)
-    return _between(lamp, field, (inner, outer), rays.hits(inner), _along(rays.power), rays.power)
+    return _between(lamp, field, side, outer, side.on_grid(rays.u, rays.v, rays.hits), _along(rays.power), rays.power)
 
 
 def _along(like: Tensor) -> Vectors:
@@ -266,54 +259,48 @@ def _from_point(lamp: Lamp, hit: PolarHit, power: Tensor) -> LampLight:
 def through(lamp: Lamp, field: PolarField, rays: ChipRays, values: Tensor) -> LampLight:
     """Light of a chip through the lens; differentiable by the control values of r, see `sides`."""
     inner, outer = sides(values)
+    side = inner_side(lamp, field, inner)
     if lamp.chip.shape == "point":
         at = stereographic(*rays.direction)
-        if inner is None:
+        if side.undeflected:
             return _from_point(lamp, field.from_origin(outer, *at), rays.power)
-        return _between(lamp, field, (inner, outer), field.from_origin(inner, *at), _along(rays.power), rays.power)
-    hit = _on_hemisphere(lamp, rays) if inner is None else field.intersect(inner, rays.origin, rays.direction)
-    local = to_frame(frame(hit.u, hit.v), rays.direction)
-    return _between(lamp, field, (inner, outer), hit, local, rays.power)
+        return _between(lamp, field, side, outer, side.from_origin(*at), _along(rays.power), rays.power)
+    hit = side.hit(rays.origin, rays.direction)
+    return _between(lamp, field, side, outer, hit, to_frame(frame(hit.u, hit.v), rays.direction), rays.power)
 
 
-def _on_hemisphere(lamp: Lamp, rays: ChipRays) -> PolarHit:
-    """Where rays meet the hemisphere: all do."""
-    (x, y, z), (dx, dy, dz), radius = rays.origin, rays.direction, lamp.inner
-    along = x * dx + y * dy + z * dz
-    t = (along * along + (radius * radius - (x * x + y * y + z * z))).sqrt() - along  # the origin lies within: one root
-    point, flat = (x + t * dx, y + t * dy, z + t * dz), torch.zeros_like(t)
-    return PolarHit(point, *stereographic(*point), flat, flat, torch.ones_like(t, dtype=torch.bool))
+def entered(lamp: Lamp, hit: PolarHit, local: Vectors, power: Tensor) -> tuple[Vectors, Tensor, dict[str, Tensor]]:
+    """Directions within the lens behind the inner side, the power of each ray there, and what is lost by cause; local: directions
+    in front of it, in the frames of the points."""
+    met, local = _met(hit, local)
+    out, _, c, s = refract(local, hit.p, hit.q, 1.0 / lamp.index)
+    arriving = torch.where(met, power, torch.zeros_like(power))
+    reflected = arriving * reflectance("exact", c, s, 1.0 / lamp.index)
+    return from_frame(frame(hit.u, hit.v), out), arriving - reflected, {"inner_fresnel": reflected, "missed": power - arriving}
+
+
+def from_centre(lamp: Lamp, field: PolarField, directions: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
+    """Directions (N, 3) within a lens with one free-form surface of the light of the chip's centre, and its power (N,) there, of
+    sum 1 as in front of it."""
+    side = inner_side(lamp, field, None)
+    if side.undeflected:
+        return directions, power
+    within, passed, _ = entered(lamp, side.from_origin(*stereographic(*directions.unbind(1))), _along(power), power)
+    return torch.stack(within, 1), passed / passed.sum()
 
 
 def _between(
-    lamp: Lamp, field: PolarField, surfaces: tuple[Tensor | None, Tensor], hit: PolarHit, local: Vectors, power: Tensor
+    lamp: Lamp, field: PolarField, side: InnerSide, outer: Tensor, hit: PolarHit, local: Vectors, power: Tensor
 ) -> LampLight:
-    """Refraction at the inner surface, and what follows; local: directions in front of it, in the frames of the points.
+    """Refraction at the inner side, and what follows; local: as of `entered`.
 
-    Without derivatives, light that meets a free-form inner surface again, from within the lens, is booked as missed.
+    Without derivatives, light that passes through the cavity again, from within the lens, is booked as missed.
     """
-    zero, (inner, outer) = torch.zeros_like(power), surfaces
-    met, local = _met(hit, local)
-    out, _, c, s = refract(local, hit.p, hit.q, 1.0 / lamp.index)
-    arriving = torch.where(met, power, zero)
-    reflected = arriving * reflectance("exact", c, s, 1.0 / lamp.index)
-    direction = from_frame(frame(hit.u, hit.v), out)
+    direction, within, lost = entered(lamp, hit, local, power)
     further = field.intersect(outer, hit.point, direction)
-    if inner is not None and not torch.is_grad_enabled():  # in a judgement; a design has a wall instead
-        again = _meets_again(field, inner, hit.point, further.point)
-        further = further._replace(valid=further.valid & ~again)
-    lost = {"inner_fresnel": reflected, "missed": power - arriving}
-    return _leave(lamp, further, to_frame(frame(further.u, further.v), direction), arriving - reflected, lost)
-
-
-def _meets_again(field: PolarField, inner: Tensor, start: Vectors, end: Vectors) -> Tensor:
-    """Whether straight paths within the lens lie within the inner surface at one of PROBES points between their ends."""
-    with torch.no_grad():
-        found = torch.zeros_like(start[0], dtype=torch.bool)
-        for k in range(1, PROBES + 1):
-            x, y, z = (a + k / (PROBES + 1) * (b - a) for a, b in zip(start, end, strict=True))
-            found |= (x * x + y * y + z * z).sqrt() < field.net.evaluate(inner, *stereographic(x, y, z))[0]
-        return found
+    if not torch.is_grad_enabled():  # in a judgement; a design has a wall instead
+        further = further._replace(valid=further.valid & ~side.crossed(hit.point, further.point))
+    return _leave(lamp, further, to_frame(frame(further.u, further.v), direction), within, lost)
 
 
 def _met(hit: PolarHit, local: Vectors) -> tuple[Tensor, Vectors]:

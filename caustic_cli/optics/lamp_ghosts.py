@@ -5,7 +5,7 @@ through the lens to its base, to the inner surface and out of the outer one.  A 
 Fresnel equations for unpolarised light, so that it keeps its power and does not split.  The chip reflects diffusely, by Lambert's
 law, the part `Chip.reflectance` of the light; the board around it and the base of the lens are black.
 
-The surfaces are intersected, and Snell's law applied, by vectors along the normals: independently of `optics.lamp`.
+Snell's law is applied by vectors along the normals: independently of `optics.lamp`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.lamp import ChipRays, LampLight, concentric, sides
+from caustic_cli.optics.lamp_side import InnerSide, PolarSide, inner_side
 from caustic_cli.optics.surfaces.polarfield import PolarField, Vectors, stereographic
 from caustic_cli.scene.lamp import Chip, Lamp
 
 #: Every how many rays are followed, with the power of all.
 EVERY = 4
-#: Most interactions of a ray, points of a path at which it is tested against a free-form inner surface, and bisections there.
-MOST, PROBES, BISECTIONS = 40, 24, 50
+#: Most interactions of a ray.
+MOST = 40
 #: Part of its distance from the origin by which a point on a surface is moved to the side on which light goes on.
 NUDGE = 1e-9
 #: Causes for which such light is lost: absorbed by the chip, by the board in the cavity, at the base of the lens, or not followed
@@ -46,59 +47,27 @@ class Going(NamedTuple):
 
 
 class Sides(NamedTuple):
-    """Both surfaces of a lens; inner: control values, None for the hemisphere."""
+    """Both sides of a lens; outer: control values."""
 
     lamp: Lamp
     field: PolarField
-    inner: Tensor | None
+    inner: InnerSide
     outer: Tensor
 
     def in_cavity(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance (N,) along rays in the cavity to the inner surface, and whether they meet it before the plane of the chip."""
-        if self.inner is not None:
-            return _within(self.field, self.inner, o, d)
-        along = (o * d).sum(1)
-        t = (along * along + (self.lamp.inner**2 - (o * o).sum(1)).clamp_min(0.0)).sqrt() - along
-        return t, o[:, 2] + t * d[:, 2] >= 0
+        """Distance (N,) along rays in the cavity to the inner side, and whether they meet it before the plane of the chip."""
+        hit = self.inner.hit(_three(o.unbind(1)), _three(d.unbind(1)))
+        at = torch.stack(hit.point, 1)
+        return ((at - o) * d).sum(1), hit.valid & (at[:, 2] >= 0)
 
     def to_outer(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """The same within the lens to the outer surface."""
-        return _within(self.field, self.outer, o, d)
-
-    def to_inner(self, o: Tensor, d: Tensor, most: Tensor) -> Tensor:
-        """Distance along rays within the lens at which they meet the inner surface, inf beyond `most`."""
-        if self.inner is None:
-            along = (o * d).sum(1)
-            square = along * along - (o * o).sum(1) + self.lamp.inner**2
-            t = torch.where((square > 0) & (along < 0), -along - square.clamp_min(0.0).sqrt(), torch.full_like(along, math.inf))
-            return torch.where((t > 0) & (o[:, 2] + t * d[:, 2] >= 0), t, torch.full_like(t, math.inf))
-        low, high = torch.zeros_like(most), torch.full_like(most, math.inf)
-        for k in range(1, PROBES + 1):
-            t = k / PROBES * most
-            open_ = torch.isinf(high)
-            deep = open_ & (self._depth(o + t[:, None] * d) > 0)
-            high, low = torch.where(deep, t, high), torch.where(open_ & ~deep, t, low)
-        met = torch.isfinite(high)
-        end = torch.where(met, high, most)
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + end)
-            deep = self._depth(o + middle[:, None] * d) > 0
-            low, end = torch.where(deep, low, middle), torch.where(deep, middle, end)
-        return torch.where(met, low, torch.full_like(low, math.inf))
-
-    def _depth(self, at: Tensor) -> Tensor:
-        """Depth of points within a free-form inner surface, along radii, mm; none beyond the plane of the chip."""
-        assert self.inner is not None
-        x, y, z = at.unbind(1)
-        r = self.field.net.evaluate(self.inner, *stereographic(x, y, z.clamp_min(0.0)))[0]
-        return torch.where(z >= 0, r - at.norm(dim=1), torch.full_like(r, -1.0))
+        hit = self.field.intersect(self.outer, _three(o.unbind(1)), _three(d.unbind(1)))
+        return ((torch.stack(hit.point, 1) - o) * d).sum(1), hit.valid
 
     def normals(self, at: Tensor, outer: bool) -> Tensor:
         """Unit normals away from the origin at points (N, 3)."""
-        values = self.outer if outer else self.inner
-        if values is None:
-            return at / at.norm(dim=1, keepdim=True)
-        return torch.stack(self.field.normals(values, *stereographic(*at.unbind(1))), 1)
+        return (PolarSide(self.field, self.outer) if outer else self.inner).normals_at(at)
 
 
 def ghosts(lamp: Lamp, field: PolarField, values: Tensor, rays: ChipRays, rng: np.random.Generator) -> LampLight:
@@ -107,7 +76,8 @@ def ghosts(lamp: Lamp, field: PolarField, values: Tensor, rays: ChipRays, rng: n
     lost: what it books by `ENDS`, and, negative, what it does not book as reflected any more: the sum of all with the light that
     leaves is 0.  No light of `spare`.
     """
-    both = Sides(lamp, field, *sides(values))
+    inner, outer = sides(values)
+    both = Sides(lamp, field, inner_side(lamp, field, inner), outer)
     with torch.no_grad():
         begun, reflected = _reflected_once(both, rays)
         found, ends = _followed(both, begun, rng)
@@ -182,7 +152,7 @@ def _followed(both: Sides, going: Going, rng: np.random.Generator) -> tuple[list
         o, d = cavity.origin * (1.0 - NUDGE), cavity.direction
         t, met = both.in_cavity(o, d)
         lower = d[:, 2] < 0
-        book("unfollowed", cavity.power[~met & ~lower])
+        book("base", cavity.power[~met & ~lower])  # the side of a cavity with a flat roof
         on.append(_interact(both, cavity, o + t[:, None] * d, met, False, rng))
         on.append(_from_chip(lamp.chip, cavity.where(~met & lower), book, rng))
         # Through the lens, to the outer surface, to the inner one or to the base
@@ -190,10 +160,12 @@ def _followed(both: Sides, going: Going, rng: np.random.Generator) -> tuple[list
         here = glass.origin * (1.0 + NUDGE * (1.0 - 2.0 * inwards))[:, None]
         d = glass.direction
         outer, reaches = both.to_outer(here, d)
-        base = torch.where(d[:, 2] < 0, -here[:, 2] / d[:, 2].clamp_max(-1e-300), torch.full_like(outer, math.inf))
+        down = (both.inner.rim - here[:, 2]) / d[:, 2].clamp_max(-1e-300)
+        base = torch.where(d[:, 2] < 0, down.clamp_min(0.0), torch.full_like(outer, math.inf))
+        reaches &= outer <= base
         most = torch.where(reaches, outer, torch.minimum(base, torch.full_like(base, 4.0 * lamp.radius)))
-        inner = both.to_inner(here, d, most)
-        back = inner < most
+        inner = both.inner.met_from_glass(here, d, most)
+        back = inner <= most
         outwards = reaches & ~back
         book("base", glass.power[~back & ~outwards & torch.isfinite(base)])
         book("unfollowed", glass.power[~back & ~outwards & torch.isinf(base)])
@@ -241,10 +213,3 @@ def _from_chip(chip: Chip, rays: Going, book, rng: np.random.Generator) -> Going
     up = torch.stack([dx, dy, (1.0 - dx * dx - dy * dy).clamp_min(0.0).sqrt()], 1)
     start = torch.cat([at[hit & (chip.reflectance > 0)][:, :2], torch.zeros(len(own.power), 1, dtype=torch.float64)], 1)
     return Going(start, up, chip.reflectance * own.power, own.inside)
-
-
-def _within(field: PolarField, values: Tensor, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance (N,) along rays from within a surface to it, and whether they meet it."""
-    hit = field.intersect(values, _three(o.unbind(1)), _three(d.unbind(1)))
-    at = torch.stack(hit.point, 1)
-    return ((at - o) * d).sum(1), hit.valid

@@ -1,8 +1,8 @@
 """A lamp: a lens around a light-emitting chip, and where its light is wanted.
 
 The chip lies in the plane z = 0 with its centre at the origin, and emits into z > 0 by Lambert's law.  The lens lies between a
-hemisphere about the origin, which does not deflect the light of the chip's centre, or a second free-form surface, and a free-form
-surface; its base is the ring between the two in the plane z = 0.
+hemisphere about the origin, which does not deflect the light of the chip's centre, a plane, the roof of a cylindrical cavity, or a
+second free-form surface, and a free-form surface; its base is the ring between the two in the plane z = 0.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ SHAPES = ("point", "disc", "rectangle", "rays")
 CLASS = 5.0
 #: Points of a pixel along both axes at which its solid angle is taken, and pixels of that of a whole target.
 WITHIN, WHOLE = 3, (300, 300)
+#: Angles from the axis over which light is summed.
+STEPS = 10_000
 #: Border of a target, a fraction of its smaller side, that is no part of its interior: least, and most where a chip blurs more.
 BORDERS = (0.025, 0.1)
 #: Most lamps of an array.
@@ -82,6 +84,11 @@ class Chip:
     def centre(self) -> Chip:
         """A point that emits as the chip does."""
         return Chip(intensity=self.intensity)
+
+    @property
+    def top(self) -> float:
+        """Height of its uppermost point above the plane z = 0, mm."""
+        return 0.0 if self.rays is None else max(0.0, float(self.rays.positions[:, 2].max()))
 
     @property
     def reach(self) -> float:
@@ -211,7 +218,7 @@ class Lamp:
     chip: Chip = field(default_factory=Chip)
     #: Refractive index.
     index: float = 1.49
-    #: Radius of the hemisphere around the chip, mm.
+    #: Radius of the hemisphere around the chip, or of a cavity with a flat roof, mm.
     inner: float = 4.0
     #: Greatest distance of the free-form surface from the chip's centre, mm, and least distance from the hemisphere.
     radius: float = 15.0
@@ -224,6 +231,8 @@ class Lamp:
     #: Lamps of an array along x and y, each with its chip, and their distances, mm: one part on a board, which the foot is.
     array: tuple[int, int] = (1, 1)
     pitch: tuple[float, float] = (0.0, 0.0)
+    #: Height of a flat inner side above the chip, mm; None for another one.
+    flat: float | None = None
     #: Whether light that is reflected within the lens is followed (`optics.lamp_ghosts`) instead of booked as lost.
     ghosts: bool = False
 
@@ -237,6 +246,11 @@ class Lamp:
             )
         if self.surfaces not in (1, 2):
             raise InputError(f"a lamp has 1 or 2 free-form surfaces, got {self.surfaces!r}")
+        if self.flat is not None and (self.surfaces > 1 or not self.chip.top < self.flat < self.radius - self.wall):
+            raise InputError(
+                f"⟨lamp.flat⟩ must be greater than the height of the chip, {self.chip.top:g} mm, and less than"
+                f" {self.radius - self.wall:g} mm, with one free-form surface, got {self.flat:g} mm and {self.surfaces}"
+            )
         if not 1.0 < self.index <= 5.0:
             raise InputError(f"⟨lens.index⟩ of a lamp must be greater than 1 and at most 5, got {self.index!r}")
         if not all(0 <= s < math.inf for s in (self.base, self.flange)) or (self.flange > 0 and self.base == 0):
@@ -273,8 +287,8 @@ class Lamp:
 
     def blur(self, goal: Goal) -> float:
         """Full width of a point of the picture, mm or degrees: the chip as seen from the greatest radius of the lens, on the
-        axis.  It is wider off the axis, and where the surface is nearer to the chip."""
-        angle = max(self.chip.size) / self.radius
+        axis, through a plane as large as through air.  It is wider off the axis, and where the surface is nearer to the chip."""
+        angle = max(self.chip.size) / self.radius * (1.0 if self.flat is None else self.index)
         return math.degrees(angle) if goal.far else angle * goal.distance
 
     def border(self, goal: Goal) -> float:
@@ -284,5 +298,16 @@ class Lamp:
 
     @property
     def uncoated_limit(self) -> float:
-        """Largest fraction of the light that can leave without coatings: (1 - R)^2, R = ((n - 1) / (n + 1))^2."""
-        return (1.0 - ((self.index - 1.0) / (self.index + 1.0)) ** 2) ** 2
+        """Largest fraction of the light that can leave without coatings: (1 - R)^2, R = ((n - 1) / (n + 1))^2, of normal incidence;
+        through a flat inner side what passes that of the light of the chip's centre."""
+        normal = 1.0 - ((self.index - 1.0) / (self.index + 1.0)) ** 2
+        return normal * (normal if self.flat is None else self._entering(self.flat))
+
+    def _entering(self, height: float) -> float:
+        """Part of the light of the chip's centre that passes a plane at this height, within the cavity, by Fresnel's equations."""
+        angle, n = 0.5 * math.pi * (np.arange(STEPS) + 0.5) / STEPS, self.index
+        outside, inside = np.cos(angle), np.sqrt(1.0 - (np.sin(angle) / n) ** 2)
+        light = np.sin(angle) * (outside if self.chip.intensity is None else self.chip.intensity.relative(angle))
+        meets = height * np.tan(angle) <= self.inner
+        across, along = (outside - n * inside) / (outside + n * inside), (n * outside - inside) / (n * outside + inside)
+        return float((light * meets * (1.0 - 0.5 * (across**2 + along**2))).sum() / light.sum())

@@ -296,8 +296,12 @@ class LampSettings(Section):
     radius: float | None = setting("design a lamp: a lens around a Lambertian chip at the origin that emits along +z, for all its"
             " light; greatest distance of the free-form surface from the chip", "mm", *LENS, derived="no lamp",
             option=Option("--lamp", "MM"))
-    inner: float | None = setting("radius of the hemisphere around the chip that is the inner side of the lens", "mm", *LENS,
-            derived="4/15 of lamp.radius, 2/15 with two free-form surfaces", option=Option("--lamp-inner", "MM"))
+    inner: float | None = setting("radius of the hemisphere around the chip that is the inner side of the lens, or of the cavity"
+            " below a flat one", "mm", *LENS, derived="4/15 of lamp.radius, 2/15 with two free-form surfaces",
+            option=Option("--lamp-inner", "MM"))
+    flat: float | None = setting("height above the chip of a flat inner side instead of the hemisphere: the roof of a cylindrical"
+            " cavity of the radius lamp.inner, whose side is matt", "mm", *LENS, derived="a hemisphere",
+            option=Option("--lamp-flat", "MM"))
     surfaces: int = setting("free-form surfaces: 1, around a hemisphere, or 2, which share the deflection; lamp.inner is then the"
             " least radius of the inner one", low=1, high=2, default=1, why="one is cheaper to make", written=False,
             option=Option("--lamp-surfaces", "1|2"))

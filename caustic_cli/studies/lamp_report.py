@@ -30,6 +30,8 @@ from caustic_cli.studies.report import COLOURS
 
 #: Fractions of the greatest value at which lines are drawn, and range of the relative error that is shown.
 LINES, ERROR = (0.1, 0.25, 0.5, 0.75, 0.9), 0.1
+#: Least part of the light whose loss is shown.
+LEAST = 5e-4
 #: Points of a section; pixels over which the light is averaged along either axis.
 POINTS, SMOOTH = 181, 5
 
@@ -51,7 +53,7 @@ def write_lamp_report(
         image, wanted: part of the light on each pixel, (n_x, n_y), and as it should be; figures: as of `studies.lamp`.
     """
     figure = Figure(figsize=(15.0, 8.0), dpi=100)
-    grid = figure.add_gridspec(2, 6, left=0.05, right=0.95, top=0.95, bottom=0.08, wspace=1.0)
+    grid = figure.add_gridspec(2, 6, left=0.05, right=0.95, top=0.95, bottom=0.12, wspace=1.0, hspace=0.35)
     _draw_light(figure, figure.add_subplot(grid[0, :3]), goal, image)
     _draw_error(figure, figure.add_subplot(grid[0, 3:]), goal, image, wanted)
     polar = figure.add_subplot(grid[1, :2], projection="polar")
@@ -131,22 +133,22 @@ def _draw_section(axis: Axes, lamp: Lamp, field: PolarField, values: Tensor) -> 
     """Sections of the lens along x and along y."""
     rho = torch.linspace(-1.0, 1.0, POINTS, dtype=torch.float64)
     zero = torch.zeros_like(rho)
-    for surface, (own, net) in zip(("outer", "inner"), surfaces_of(lamp, field, values), strict=True):
+    for surface, side in zip(("outer", "inner"), surfaces_of(lamp, field, values), strict=True):
         for name, at, colour in (("x", (rho, zero), COLOURS[0]), ("y", (zero, rho), COLOURS[1])):
-            x, y, z = own.points(net, *at)
+            x, y, z = side.points(*at)
             label = f"along {name}" if surface == "outer" else None
             axis.plot((x if name == "x" else y).numpy(), z.numpy(), color=colour, label=label)
     axis.plot([-0.5 * lamp.chip.size[0], 0.5 * lamp.chip.size[0]], [0.0, 0.0], color="black", linewidth=4.0)
     axis.plot(0.0, 0.0, "k.")
     axis.set(title="sections of the lens", xlabel="x or y (mm)", ylabel="z (mm)", aspect="equal")
-    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.3), ncols=2, fontsize=8)
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncols=2, fontsize=8)  # below the name of the axis
 
 
 def _draw_losses(axis: Axes, figures: Mapping[str, Any]) -> None:
     """Where the light of the chip goes."""
     parts = {
         "on the target": figures["of_source"],
-        **{fill(name.replace("_", " "), 14): part for name, part in figures["lost"].items()},
+        **{fill(name.replace("_", " "), 14): part for name, part in figures["lost"].items() if part > LEAST},
     }
     names = list(parts)
     bars = axis.barh(names, [100.0 * part for part in parts.values()], color=[COLOURS[2], *[COLOURS[1]] * (len(names) - 1)])

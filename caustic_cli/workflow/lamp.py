@@ -264,11 +264,12 @@ def _run(project: Project, before: Checkpoint | None, force: bool, say: Reporter
 
 def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
     """What limits a lamp, before its design: its uncoated surfaces, and the deflection of one."""
-    yield f"uncoated surfaces pass at most {lamp.uncoated_limit:.1%} of the light, by normal incidence"
+    how = "by normal incidence" if lamp.flat is None else "through a flat inner side"
+    yield f"uncoated surfaces pass at most {lamp.uncoated_limit:.1%} of the light, {how}"
     if lamp.count > 1 and not goal.far:
         width, height = lamp.places.max(0) - lamp.places.min(0)
         yield f"the pictures of the lamps lie within {width:g} x {height:g} mm of each other"
-    if lamp.surfaces == 2:
+    if lamp.surfaces == 2 or lamp.flat is not None:
         return
     most = math.degrees(math.acos(1.0 / lamp.index))
     if (needed := 90.0 - goal.nearest_edge) > most:

@@ -1,4 +1,4 @@
-"""The gallery: fourteen lenses of different kinds, designed by whole commands, with their pictures, times and figures.
+"""The gallery: fifteen lenses of different kinds, designed by whole commands, with their pictures, times and figures.
 
     python tests/benchmarks/gallery.py [--only NAME,...] [--quality draft|standard|fine] [-o DIR]
 
@@ -15,11 +15,14 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib import colormaps
 from PIL import Image, ImageDraw, ImageFont
 from quality import DATA, EXAMPLES, caustic, pictures
 
 from caustic_cli import load
+from caustic_cli.optics.lamp import sides
+from caustic_cli.workflow.lamp import LampDesign
 
 #: What each lens is for, its picture, and the options that make it.
 LENSES = {
@@ -38,6 +41,7 @@ LENSES = {
     "mark": ("A mark of 20 mm that is read in daylight, 60 mm behind a round lens", "logo", "--preset mark --invert"),
     "sundial": ("A sundial in a roof window: nine lenslets, nine hours", "dial", "--preset sundial --quality draft"),
     "led": ("A luminaire lens, 60 mm from an LED, wall at 2 m", "tophat", "--preset led-30"),
+    "lamp": ("A lens around an LED, for the passing beam of a car", "headlamp", "--preset headlamp"),
     "laser": ("A round lens in a laser beam, screen at 1 m", "flame", "--preset laser-25"),
     "beam": (
         "The beam of a laser as an even disc of 6 mm, with 0.97 of the light in it",
@@ -50,34 +54,43 @@ LENSES = {
 HEAD = """# Gallery
 
 The lenses below were designed by `python tests/benchmarks/gallery.py` on two cores. Each strip shows the target, the image by ray
-tracing, the wave image where diffraction is simulated, and the relief of the lens relative to its best-fitting quadric (each on its
-own scale). Errors are measured with rays that no design used; other work on the machine affected the times.
+tracing, the wave image where diffraction is simulated, and the relief of the lens relative to its best-fitting quadric, or of a
+lens around an LED its outer radius over the directions from there, with the axis in the middle (each on its own scale). Errors are
+measured with rays that no design used; other work on the machine affected the times.
 
 """
 #: Pixels along a panel's side.
 SIDE = 200
 
 
-def more_pictures(folder: Path) -> dict[str, Path]:
-    """Those that examples/ and the table of qualities do not have."""
+def more_pictures(folder: Path) -> dict[str, Path | str]:
+    """Those that examples/ and the table of qualities do not have, and pictures by name."""
     logo = Image.new("RGBA", (500, 500))
     draw = ImageDraw.Draw(logo)
     draw.ellipse((60, 60, 440, 440), outline=(0, 0, 0, 255), width=28)
     draw.text((250, 250), "f/2", fill=(0, 0, 0, 255), anchor="mm", font=ImageFont.truetype(f"{DATA}/fonts/ttf/DejaVuSans.ttf", 150))
     logo.save(folder / "logo.png")
-    return {"tophat": EXAMPLES / "tophat.png", "dial": EXAMPLES / "dial.png", "logo": folder / "logo.png"}
+    return {"headlamp": "headlamp", "tophat": EXAMPLES / "tophat.png", "dial": EXAMPLES / "dial.png", "logo": folder / "logo.png"}
 
 
 def relief(project: Path) -> Image.Image:
-    """The surface, less the quadric that fits it best, from dark to bright."""
+    """The surface, less the quadric that fits it best, from dark to bright; of a lamp its radius over stereographic coordinates."""
     lens = load(project)
+    if isinstance(lens, LampDesign):
+        u, v = np.meshgrid(np.linspace(-1.0, 1.0, SIDE), np.linspace(1.0, -1.0, SIDE))
+        net = lens.field.net.evaluate(sides(lens.values)[1], *(torch.from_numpy(c.reshape(-1)) for c in (u, v)))[0]
+        return shaded(np.where(u * u + v * v <= 1.0, net.numpy().reshape(u.shape), np.nan))
     rx, ry = lens.scene.lens.half_size
     x, y = np.meshgrid(np.linspace(-rx, rx, SIDE), np.linspace(ry, -ry, SIDE))
     z = lens.surface(x, y)[0]
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1).reshape(-1, 6)
-    z = z - (terms @ np.linalg.lstsq(terms, z.ravel(), rcond=None)[0]).reshape(z.shape)
-    low, high = np.percentile(z, (0.5, 99.5))
-    shown = colormaps["cividis"](np.clip((z - low) / max(high - low, 1e-12), 0.0, 1.0))[..., :3]
+    return shaded(z - (terms @ np.linalg.lstsq(terms, z.ravel(), rcond=None)[0]).reshape(z.shape))
+
+
+def shaded(z: np.ndarray) -> Image.Image:
+    """Values from dark to bright, white where there are none."""
+    low, high = np.nanpercentile(z, (0.5, 99.5))
+    shown = colormaps["cividis"].with_extremes(bad="white")(np.clip((z - low) / max(high - low, 1e-12), 0.0, 1.0))[..., :3]
     return Image.fromarray((shown * 255).astype(np.uint8))
 
 
@@ -86,7 +99,8 @@ def strip(project: Path, path: Path) -> None:
     if (project / "hours.png").exists():  # the pictures of all hours, whose mean is the target
         panels = [Image.open(project / name) for name in ("target.png", "hours.png")]
     else:
-        target = load(project).target
+        lens = load(project)
+        target = lens.picture if isinstance(lens, LampDesign) else lens.target
         light = np.moveaxis(np.atleast_3d(target if target.ndim == 2 else np.moveaxis(target, 0, -1)), (0, 1), (1, 0))[::-1]
         codes = (np.clip(light / np.percentile(light.max(-1), 99.9), 0.0, 1.0) ** (1 / 2.2) * 255).astype(np.uint8)
         names = [name for name in ("render.png", "wave.png") if (project / name).exists()]
@@ -99,12 +113,13 @@ def strip(project: Path, path: Path) -> None:
     sheet.save(path, optimize=True)
 
 
-def row(name: str, picture: Path, quality: str, folder: Path, out: Path) -> str:
+def row(name: str, picture: Path | str, quality: str, folder: Path, out: Path) -> str:
     """Design, retrace with eight times the rays, draw; a part of the gallery's page."""
     words, _, options = LENSES[name]
     project = folder / f"{name}.caustic"
     began = time.monotonic()
-    said = caustic("design", picture, "--quality", quality, *options.split(), "-o", project)
+    how = options.split() + (["--quality", quality] if quality != "standard" else [])  # which a lamp has not
+    said = caustic("design", picture, *how, "-o", project)
     seconds = time.monotonic() - began
     sharp = caustic("render", project, "--rays", "3.2e7" if said.get("least_relative_rms") is None else "8e6")
     strip(project, out / f"{name}.png")
@@ -112,17 +127,21 @@ def row(name: str, picture: Path, quality: str, folder: Path, out: Path) -> str:
     errors = {"rays": f"by rays {sharp['relative_rms']:.3f} ± {sharp['noise']:.4f}"}
     if sharp.get("wave_relative_rms") is not None:
         errors["waves"] = f"of the wave image {sharp['wave_relative_rms']:.3f}"
-    judged = errors.pop(sharp["error_by"])
+    judged = errors.pop(sharp.get("error_by", "rays"))
+    seen = sharp[{"waves": "wave_on_target", "rays": "on_target"}.get(sharp.get("error_by"), "of_source")]
+    beside = sharp["of_source"] != sharp.get("on_target", seen)
+    emitted = f", {100.0 * sharp['of_source']:.3g}% of all the source emits" if beside else ""
     figures = [
         f"relative RMS error {judged}" if not contrasts else "",  # of a sundial it would be that of the mean of all hours
         f"at least {said['least_relative_rms']:.3f} for any lens, by the source's blur" if said.get("least_relative_rms") else "",
-        f"light on the picture {sharp['wave_on_target' if sharp['error_by'] == 'waves' else 'on_target']:.1%}"
-        + (f", {100.0 * sharp['of_source']:.3g}% of all the source emits" if sharp["of_source"] != sharp["on_target"] else ""),
+        f"light on the picture {seen:.1%}{emitted}",
+        f"without its outer {sharp['border']:.3g} {sharp['border_unit']} {sharp['interior_rms']:.3f}" if "border" in sharp else "",
+        f"its upper edge is {sharp['cut_off']:.2f} degrees wide" if sharp.get("cut_off") is not None else "",
         f"at its hour each is at least {min(contrasts):.3g} times as bright as the light of the others there" if contrasts else "",
         f"designed in {seconds:.0f} s",
         *errors.values(),
     ]
-    command = f"caustic design {picture.name} {options}".strip() + (f" --quality {quality}" if quality != "standard" else "")
+    command = f"caustic design {Path(picture).name} {options}".strip() + (f" --quality {quality}" if quality != "standard" else "")
     return f"## {words}\n\n![{words}]({name}.png)\n\n{'; '.join(filter(None, figures))}.\n\n```sh\n{command}\n```\n"
 
 
