@@ -106,7 +106,8 @@ class Effort:
     lamp_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 20_000, 100, 0.1),
         (5_600, 60_000, 150, 0.03),
-        (24_000, 1_000_000, 200, 0.006),
+        (24_000, 600_000, 100, 0.006),
+        (96_000, 1_000_000, 60, 0.006),
     )
     #: The same for two free-form surfaces, after the first of the stages above with one.
     two_stages: tuple[tuple[int, int, int, float], ...] = (
@@ -118,7 +119,7 @@ class Effort:
     chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_100, 300_000, 90, 0.045),)
     #: Spans of the spline along both axes in a stage with enough pixels; cells of the light along both axes for the transport;
     #: pixels by which the uniformity of the light is judged.
-    lamp_spans: int = 128
+    lamp_spans: int = 256
     lamp_cells: int = 44
     lamp_coarse: int = 2_700
 
