@@ -81,11 +81,10 @@ class Effort:
     #: improved thin lines from 0.094 to 0.093, 12 spans in the same time to 0.081.  From 1152 spans on the start is evaluated on
     #: finer cells than it is solved on.
     creased: Refinement
-    #: The same for systems without a fused kernel, two free-form sides or a lens among other elements.
+    #: The same for systems without a fused kernel, a lens among other elements.
     system: Refinement
-    #: After that of two free-form sides: the exit alone, behind whose fixed entrance there is a fused kernel, on a net that has no
-    #: ripples as wide as pixels, and with subpixels that show them; None for none.
-    exit_alone: Refinement | None
+    #: The same for two free-form sides, on nets that have no ripples as wide as pixels, and with subpixels that show them.
+    sides: Refinement
     #: (wavelengths of white light, iterations) of each stage on the wave image: the first ones need few.
     waves: tuple[tuple[int, int], ...]
     #: Time for them with `waves = "auto"`, s on two cores.
@@ -154,7 +153,7 @@ DRAFT = Effort(
     refinement=Refinement(1.0, 256, 16, 1_000_000, 3, ((1.0, 8),), large=LargePictures(256)),
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
     system=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
-    exit_alone=None,
+    sides=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
     waves=((3, 6), (5, 6)),
     wave_seconds=8.0,
 )
@@ -167,7 +166,7 @@ STANDARD = Effort(
     ),
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 48, 3_000_000, 4, ((1.0, 50),)),
-    exit_alone=Refinement(6.0, 1152, 64, 4_000_000, 8, ((1.0, 16),), 96),
+    sides=Refinement(3.0, 765, 64, 4_000_000, 8, ((1.0, 20),)),
     waves=((5, 20), (6, 20)),
     wave_seconds=25.0,
 )
@@ -177,7 +176,7 @@ FINE = Effort(
     refinement=Refinement(2.0, 957, 256, 16_000_000, 8, ((0.25, 16), (1.0, 16)), large=LargePictures(700)),
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 64, 4_000_000, 4, ((1.0, 200),)),
-    exit_alone=Refinement(6.0, 1152, 64, 4_000_000, 8, ((1.0, 60),), 96),
+    sides=Refinement(4.0, 1021, 64, 4_000_000, 8, ((1.0, 60),)),
     waves=((5, 12), (6, 12), (8, 40)),
     wave_seconds=90.0,
 )
