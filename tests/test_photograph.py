@@ -597,6 +597,15 @@ def test_what_is_no_photograph_of_the_caustic_is_refused(lens, here, capfd, name
     assert not Path("x.caustic").exists()
 
 
+@pytest.mark.parametrize(("across", "along", "words"), [(-1, -1, "is rotated by 180 degrees"), (-1, 1, "is mirrored")])
+def test_a_part_mounted_in_another_way_before_an_upright_card_is_refused(lens, here, across, along, words):
+    x, y = landed(lens, lens.heights, None, rays=500)
+    photograph(lens, None, SHARP, light=(across * x, along * y))
+    with pytest.raises(InputError, match=words) as refusal:
+        judged(lens, "marks.csv")
+    assert "the part or the card is mounted so" in str(refusal.value)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -34,6 +34,9 @@ BRIGHT = 0.3
 BY_PICTURE = (0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.02, 0.02, 0.02)
 CORNERS = ((-1.0, 1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
 MARKS = "lines of column, row, x, y: pixels from the centre of the upper left one, and mm on the screen, of at least 4 marks"
+#: What is needed instead of a photograph that is turned, and of one whose marks are upright.
+UPRIGHT = "a photograph with column 0 at the screen's -x edge and row 0 at its +y edge is needed, or one with the test card"
+TURNED = "its marks are upright, so that the part or the card is mounted so; one with both as designed is needed"
 #: The ways in which a screen may be seen, as functions of images [i, j], with what they are called.
 SEEN = {
     "": lambda a: a,
@@ -199,8 +202,8 @@ def refuse_unlike(photograph: Photograph, expected: np.ndarray) -> float:
     best = max(like, key=lambda words: like[words][1])
     if like[best][0] >= LEAST_LIKE and like[best][1] > inner + BETTER:
         raise InputError(
-            f"{best}: it is like the image of the lens (correlation {like[best][1]:.2f}) only then, as it is {inner:.2f};"
-            " a photograph with column 0 at the screen's -x edge and row 0 at its +y edge is needed, or one with the test card"
+            f"{best}: it is like the image of the lens (correlation {like[best][1]:.2f}) only then, as it is {inner:.2f}; "
+            + (TURNED if photograph.camera.marks else UPRIGHT)
         )
     if whole < LEAST_LIKE:
         raise InputError(
