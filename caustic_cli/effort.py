@@ -81,11 +81,10 @@ class Effort:
     #: improved thin lines from 0.094 to 0.093, 12 spans in the same time to 0.081.  From 1152 spans on the start is evaluated on
     #: finer cells than it is solved on.
     creased: Refinement
-    #: The same for systems without a fused kernel, two free-form sides or a lens among other elements.
+    #: The same for systems without a fused kernel, a lens among other elements.
     system: Refinement
-    #: After that of two free-form sides: the exit alone, behind whose fixed entrance there is a fused kernel, on a net that has no
-    #: ripples as wide as pixels, and with subpixels that show them; None for none.
-    exit_alone: Refinement | None
+    #: The same for two free-form sides, on nets that have no ripples as wide as pixels, and with subpixels that show them.
+    sides: Refinement
     #: (wavelengths of white light, iterations) of each stage on the wave image: the first ones need few.
     waves: tuple[tuple[int, int], ...]
     #: Time for them with `waves = "auto"`, s on two cores.
@@ -106,7 +105,8 @@ class Effort:
     lamp_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 20_000, 100, 0.1),
         (5_600, 60_000, 150, 0.03),
-        (24_000, 1_000_000, 200, 0.006),
+        (24_000, 600_000, 100, 0.006),
+        (96_000, 1_000_000, 60, 0.006),
     )
     #: The same for two free-form surfaces, after the first of the stages above with one.
     two_stages: tuple[tuple[int, int, int, float], ...] = (
@@ -118,7 +118,7 @@ class Effort:
     chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_100, 300_000, 90, 0.045),)
     #: Spans of the spline along both axes in a stage with enough pixels; cells of the light along both axes for the transport;
     #: pixels by which the uniformity of the light is judged.
-    lamp_spans: int = 128
+    lamp_spans: int = 256
     lamp_cells: int = 44
     lamp_coarse: int = 2_700
 
@@ -153,7 +153,7 @@ DRAFT = Effort(
     refinement=Refinement(1.0, 256, 16, 1_000_000, 3, ((1.0, 8),), large=LargePictures(256)),
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
     system=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
-    exit_alone=None,
+    sides=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
     waves=((3, 6), (5, 6)),
     wave_seconds=8.0,
 )
@@ -166,7 +166,7 @@ STANDARD = Effort(
     ),
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 48, 3_000_000, 4, ((1.0, 50),)),
-    exit_alone=Refinement(6.0, 1152, 64, 4_000_000, 8, ((1.0, 16),), 96),
+    sides=Refinement(3.0, 765, 64, 4_000_000, 8, ((1.0, 20),)),
     waves=((5, 20), (6, 20)),
     wave_seconds=25.0,
 )
@@ -176,7 +176,7 @@ FINE = Effort(
     refinement=Refinement(2.0, 957, 256, 16_000_000, 8, ((0.25, 16), (1.0, 16)), large=LargePictures(700)),
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     system=Refinement(2.0, 384, 64, 4_000_000, 4, ((1.0, 200),)),
-    exit_alone=Refinement(6.0, 1152, 64, 4_000_000, 8, ((1.0, 60),), 96),
+    sides=Refinement(4.0, 1021, 64, 4_000_000, 8, ((1.0, 60),)),
     waves=((5, 12), (6, 12), (8, 40)),
     wave_seconds=90.0,
 )

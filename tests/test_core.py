@@ -33,7 +33,7 @@ print(losses[0], losses[-1], *(name for name in sys.modules if name.startswith("
 """
 #: Modules of the core beside those of scene and optics: of the table of settings, the inverse problem, and messages.
 INVERSE = {"constraints", "designer", "lbfgs", "loss_terms", "losses", "objective", "optimisers", "parametrisation", "penalties"}
-INVERSE |= {"problem", "ranks", "schedule"}
+INVERSE |= {"problem", "schedule"}
 #: Rooms of scene and optics that are optional.
 OPTIONAL = ("kernels", "gradient", "waves", "mesh", "misalignment", "obstruction", "reintersection", "bounds", "plan", "spread")
 

@@ -19,9 +19,11 @@ from caustic_cli.inverse.lamp import (
     design_lamp,
     directions_of,
     field_of,
+    final_field,
     judged_pixels,
     pixels_of,
     refined,
+    stages_of,
     wanted,
 )
 from caustic_cli.inverse.lamp_limits import chip_limits, etendue_limit, least_error
@@ -473,8 +475,14 @@ def test_a_net_of_more_spans_is_the_same_surface():
 
 def test_a_lamp_is_judged_on_pixels_half_as_wide_as_those_refined():
     goal = Goal((30_000.0, 10_000.0), 8000.0)
-    for lamp, (across, along) in ((Lamp(), (268, 90)), (Lamp(Chip("disc", (1.0, 1.0))), (96, 32))):
+    for lamp, (across, along) in ((Lamp(), (537, 179)), (Lamp(surfaces=2), (268, 90)), (Lamp(Chip("disc", (1.0, 1.0))), (96, 32))):
         assert judged_pixels(lamp, goal, STANDARD) == (2 * across, 2 * along)
+
+
+def test_a_design_has_the_spans_that_the_pixels_of_its_last_stage_show():
+    point, chip = Lamp(), Lamp(Chip("disc", (1.0, 1.0)))
+    assert [final_field(lamp, STANDARD).shape[0] - 3 for lamp in (point, replace(point, surfaces=2), chip)] == [256, 128, 32]
+    assert [stage[1] for _, stage in stages_of(chip, STANDARD)] == [20_000, 60_000, 300_000]  # rays: few for the point
 
 
 def test_pixels_of_a_point_are_half_as_wide():

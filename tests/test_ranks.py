@@ -11,7 +11,7 @@ import torch
 from helpers import write_blob
 
 from caustic_cli import cli
-from caustic_cli.inverse import ranks
+from caustic_cli.optics import ranks
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.project import checkpoint
@@ -65,6 +65,32 @@ def test_two_ranks_design_what_one_process_does(tmp_path, monkeypatch):
     assert torch.allclose(a.state.heights, b.state.heights, rtol=0, atol=1e-9 * moved)
     assert np.allclose([r[2] for r in a.state.history], [r[2] for r in b.state.history], rtol=1e-9)
     assert a.results["loss"] == pytest.approx(b.results["loss"], rel=1e-6)
+
+
+@pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch has no torch.distributed")
+def test_two_ranks_draw_the_bytes_of_one(tmp_path, monkeypatch):
+    """Draws and sensitivities of a tolerance analysis, and figures of finishes, dealt out to the ranks."""
+    monkeypatch.chdir(tmp_path)
+    write_blob("blob.png", 16, (5, 6), 15.0)
+    Path("c.toml").write_text(CONFIG)
+    assert cli.run(["design", "blob.png", "--config", "c.toml", "--quiet", "--iterations", "2", "-o", "lens"]) == 0
+    errors = ("draws = 11", "[index]", "sigma = 1e-3", "[throw]", "sigma = 1.0", "[form_error]", "rms = 1e-4", "shortest = 2.0")
+    Path("errors.toml").write_text("\n".join(errors))
+    render = ["render", "lens", "--tolerances", "errors.toml", "--finish", "list", "--quiet", "--threads", "1", "--rays", "1000"]
+    Path("one").mkdir(), Path("two").mkdir()
+    Path("two.py").write_text(f"import sys\nfrom caustic_cli import cli\nsys.exit(cli.run({[*render, '-o', 'two/image.png']}))")
+    environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "two.py"]
+    done = subprocess.run(torchrun, env=environment, check=False, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert cli.run([*render, "-o", "one/image.png"]) == 0
+    one, two = ({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("one", "two"))
+    assert one == two and {path.rpartition("-")[2] for path in one} == {"image.png", "tolerances.csv", "tolerances.png"}
+
+
+def test_items_in_their_order():
+    seen: list[int] = []
+    assert ranks.mapped(str, range(3), seen.append) == ["0", "1", "2"] and seen == [1, 2, 3]
 
 
 LENS = Lens((10.0, 8.0), 0.0, 1.5, (7, 6), (3, 2), offset=Offset(3.0))

@@ -109,10 +109,10 @@ def run(asked: DesignOptions) -> None:
             from caustic_cli.optics.kernels.ahead import compile_behind  # noqa: PLC0415
 
             compile_behind(["multigrid"], more=True)
-    device = asked.start_torch()
+    device = asked.start_torch(shared=True)
 
     from caustic_cli.config.lamp import asks_for_lamp, says_lamp  # noqa: PLC0415
-    from caustic_cli.inverse import ranks  # noqa: PLC0415
+    from caustic_cli.optics import ranks  # noqa: PLC0415
     from caustic_cli.workflow import lamp, library  # noqa: PLC0415
     from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
@@ -125,7 +125,7 @@ def run(asked: DesignOptions) -> None:
         return
     with _saying_what_is_kept(project if asked.resume else path), ranks.process_group(device) as rank:
         if rank > 0:
-            follow(device)
+            follow()
             return
         how: dict[str, Any] = {"force": asked.force, "movie": asked.movie, "say": say, "device": device}
         if asked.resume:

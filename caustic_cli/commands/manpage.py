@@ -160,7 +160,7 @@ more than 3 s and half of the design's time, as for a dispersive glass.
 .TP
 .B start_error, start_relative_rms, start_noise
 The same quantities for the initial surface of a design, by the same rays; by waves (start_wave_relative_rms), where it is clearly
-worse than the finished lens, at the wavelengths of the design.
+worse than the finished lens, as the first row of accuracy_cost.
 .TP
 .B tolerances
 For a tolerance study: draws, error_by, percentiles p5, p50 and p95 of error (as placed; also as relative_rms),

@@ -134,8 +134,14 @@ class OnDevice(Debugging):
     ] = None
     threads: Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")] = None
 
-    def start_torch(self) -> str:
-        """See `start_torch`."""
+    def start_torch(self, shared: bool = False) -> str:
+        """See `start_torch`.
+
+        Raises:
+            InputError: torchrun has started several processes, whose work is not `shared`.
+        """
+        if not shared and checks.rank_and_size()[1] > 1:
+            raise InputError("this is done by one process, and torchrun has started more")
         return start_torch(self.device, self.threads, self.say)
 
 

@@ -9,6 +9,7 @@ import typer
 
 from caustic_cli.commands import console, options
 from caustic_cli.errors import CausticError, InputError
+from caustic_cli.schema import checks
 
 EXAMPLES = """Examples:
 
@@ -201,7 +202,8 @@ class RenderOptions(TracingOptions, OutputOptions, options.Computation):
 
 def run(asked: RenderOptions) -> None:
     """Trace the lens of PROJECT; write the irradiance image and its figures of merit."""
-    say, rays, size = asked.say, None if asked.rays is None else options.rays("--rays", asked.rays), _checked_size(asked)
+    asked.quiet = asked.quiet or checks.rank_and_size()[0] > 0  # of several processes, the first one speaks
+    rays, size = None if asked.rays is None else options.rays("--rays", asked.rays), _checked_size(asked)
     given = {path: value for path, value in asked.given.items() if not path.startswith("design.")}  # seed, dtype: of these rays
     if asked.screen_at is not None:
         console.set_option_names(console.option_names() | {"screen.z": "--screen-at"})
@@ -214,15 +216,28 @@ def run(asked: RenderOptions) -> None:
     refuse_bad_options(given)
     if asked.tolerances is not None:
         schema.read(asked.tolerances)
-    device = asked.start_torch()
+    device = asked.start_torch(shared=True)
 
+    from caustic_cli.optics import ranks  # noqa: PLC0415
+
+    with ranks.process_group(device) as rank:
+        if rank > 0:
+            from caustic_cli.workflow.design import follow  # noqa: PLC0415
+
+            follow()
+        elif says_lamp(asked.project):
+            _render_lamp(asked, rays)
+        else:
+            _render_lens(asked, device, rays, size, given)
+
+
+def _render_lens(asked: RenderOptions, device: str, rays: int | None, size: list[int], given: dict[str, Any]) -> None:
+    """Trace a lens and print its figures; given: settings instead of the project's."""
     from caustic_cli.workflow.outputs import outputs_for  # noqa: PLC0415
     from caustic_cli.workflow.outputs.base import Request, Tracing  # noqa: PLC0415
     from caustic_cli.workflow.render import render  # noqa: PLC0415
 
-    if says_lamp(asked.project):
-        _render_lamp(asked, rays)
-        return
+    say = asked.say
     tracing = Tracing(
         rays=rays,
         tolerance=asked.tolerance,

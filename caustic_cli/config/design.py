@@ -92,7 +92,6 @@ def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
         t.spread,
         t.lenslets,
         t.spare,
-        t.exit_alone,
     )
 
 

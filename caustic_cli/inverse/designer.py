@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse import ranks
 from caustic_cli.inverse.lbfgs import UNFIT, curvature
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import Heights
 from caustic_cli.inverse.problem import Problem, Skipped
+from caustic_cli.optics import ranks
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 
@@ -153,6 +153,7 @@ class Designer:
         time_limit: float = math.inf,
         stop: Callable[[], bool] = lambda: False,
         on_iteration: Callable[[State], None] = lambda s: None,
+        on_objective: Callable[[State], None] = lambda s: None,
         notice: Callable[[str], None] = lambda text: None,
     ) -> State:
         """Continue from `state` until the stages are done.
@@ -162,6 +163,7 @@ class Designer:
             time_limit: seconds for this run, shared by the stages in proportion to their cost.
             stop: called after every iteration; True ends the run with a complete state.
             on_iteration: called after every iteration.
+            on_objective: called when the objective of a stage is ready, before its iterations.
             notice: called with messages for the user, such as of a rejected step.
 
         Raises:
@@ -180,7 +182,7 @@ class Designer:
             limit = iterations or sum(s.iterations for s in used.values())
             end = partial(self._end, state, k, limit, deadline, stop)
             try:
-                done = self._stage(state, k, end, on_iteration, notice)
+                done = self._stage(state, k, end, on_iteration, on_objective, notice)
             except Skipped as skipped:
                 notice(f"stage {k + 1}: {skipped}")
                 state.reason, done = skipped.reason, True
@@ -222,7 +224,7 @@ class Designer:
             return not final
         return None
 
-    def _stage(self, state: State, k: int, end: Callable[[], bool | None], on_iteration, notice) -> bool:
+    def _stage(self, state: State, k: int, end: Callable[[], bool | None], on_iteration, on_objective, notice) -> bool:
         """Iterate stage k in place until its `end`.  True: the stage is done; False: the whole design ends here.
 
         Raises:
@@ -235,6 +237,7 @@ class Designer:
                 method = self.problem.optimiser(k)(self.objective(k, heights), heights, self.options.lr)
                 if state.optimizer:
                     method.load(state.optimizer)
+                self._apart(on_objective, state)
             told = method.rejected > 0
             moved = method.step()
             if method.rejected and not told:
@@ -251,9 +254,14 @@ class Designer:
             state.iteration, state.total, state.seconds = state.iteration + 1, state.total + 1, self._clock()
             state.history.append((state.total, k, method.loss, method.on_screen, state.seconds))
             state.parameters, state.optimizer, state.image = heights.state_dict(), method.state(), method.image
-            on_iteration(state)
-            self._origin += self._clock() - state.seconds  # which is not the time of the design itself
+            self._apart(on_iteration, state)
         return done
+
+    def _apart(self, called: Callable[[State], None], state: State) -> None:
+        """Call it, outside the clock of the design."""
+        before = self._clock()
+        called(state)
+        self._origin += self._clock() - before
 
     def objective(self, k: int, heights: Heights) -> LossOfHeights:
         """The objective of stage k, for heights near those of the parametrisation."""

@@ -104,6 +104,7 @@ def design_gradient_index(
     iterations: int = 25,
     rays: int | None = None,
     seed: int = 0,
+    begin: np.ndarray | None = None,
     on_iteration: Callable[[int, float, float, Tensor | None], None] = lambda k, loss, on_screen, image: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> GradientIndexDesign:
@@ -116,6 +117,7 @@ def design_gradient_index(
         limits: least and largest control value; n_0 - 0.05 and n_0 + 0.05 unless given.
         cells: source cells of the transport along the longer side.
         iterations: of L-BFGS; rays: traced in each, None for RAYS_A_PIXEL per pixel; seed: of the rays.
+        begin: initial control values (n, m, layers), such as those of an earlier design; from optimal transport unless given.
         on_iteration: called with the iteration, the loss, the fraction of the light on the screen and the image there.
         stop: called before every iteration; True ends the design.
 
@@ -124,14 +126,15 @@ def design_gradient_index(
     """
     lens = scene.lens
     low, high = limits or (lens.index - 0.05, lens.index + 0.05)
-    layer = _first_layer(scene, target, control, (low, high), cells)
+    _refuse(scene, (low, high))
+    values = torch.from_numpy(begin) if begin is not None else _first_layer(scene, target, control, (low, high), cells)
 
     def volume(values: Tensor) -> SplineIndex:
         return SplineIndex(values, lens.half_size, lens.offset.thickness - lens.z_in)
 
-    initial = volume(layer[:, :, None].expand(-1, -1, layers).contiguous())
+    initial = volume(values.reshape(*control, -1).expand(-1, -1, layers).contiguous())
     objective = _IndexObjective(scene, target, initial, rays or RAYS_A_PIXEL * math.prod(scene.screen.resolution), seed)
-    loss = _LossOfLayers(objective, layer, layers, (low, high))
+    loss = _LossOfLayers(objective, initial.coefficients, (low, high))
     search = LBFGS(loss, torch.zeros(layers * math.prod(control), dtype=torch.float64))
     history: list[tuple[float, float]] = []
     for k in range(iterations):
@@ -147,11 +150,12 @@ def design_gradient_index(
 
 
 class _LossOfLayers:
-    """The loss as a function of unknowns x (layers n m,), which are 0 for control values (n, m, layers) of layers all alike."""
+    """The loss as a function of unknowns x (layers n m,), which are 0 for the initial control values (n, m, layers)."""
 
-    def __init__(self, objective: _IndexObjective, layer: Tensor, layers: int, limits: tuple[float, float]):
-        low, high = (torch.full_like(layer, limit, dtype=torch.float64) for limit in limits)
-        self.objective, self.nets = objective, [FreeHeights(low, high, layer, laplacian=True) for _ in range(layers)]
+    def __init__(self, objective: _IndexObjective, initial: Tensor, limits: tuple[float, float]):
+        layers = [layer.contiguous() for layer in initial.double().unbind(-1)]
+        low, high = (torch.full_like(layers[0], limit) for limit in limits)
+        self.objective, self.nets = objective, [FreeHeights(low, high, layer, laplacian=True) for layer in layers]
         #: By their loss.
         self.evaluations: dict[float, Evaluation] = {}
         self.is_lit = False
@@ -175,14 +179,19 @@ class _LossOfLayers:
         return result.loss, torch.stack(by).reshape(-1)
 
 
-def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], limits: tuple[float, float], cells: int) -> Tensor:
-    """Control values (n, m) of the initial index within its limits, independent of z; errors as of `design_gradient_index`."""
+def _refuse(scene: Scene, limits: tuple[float, float]) -> None:
+    """Refuse what has no such design; errors as of `design_gradient_index`."""
     lens, (low, high) = scene.lens, limits
     INDEX_DESIGN.refuse(scene)
     if not 1.0 <= low < high <= 5.0:
         raise InputError(f"⟨lens.index_range⟩ must ascend within 1 to 5, got [{low:g}, {high:g}]")
     if not lens.offset.thickness > lens.z_in:
         raise InputError(f"⟨lens.thickness⟩ must lie behind the entrance at {lens.z_in:g} mm, got {lens.offset.thickness:g} mm")
+
+
+def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], limits: tuple[float, float], cells: int) -> Tensor:
+    """Control values (n, m) of the initial index within its limits, independent of z; errors as of `design_gradient_index`."""
+    lens, (low, high) = scene.lens, limits
     net = HeightField.of(replace(lens, control=control, degree=(3, 3), knots=None, gradient=None))
     layer = _start(scene, target, net, cells)
     layer = layer - 0.5 * float(layer.min() + layer.max()) + 0.5 * (low + high)

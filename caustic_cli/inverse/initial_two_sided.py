@@ -17,7 +17,7 @@ Both surfaces obey the same vector form of Snell's law (`surface_from_map`), wit
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ from caustic_cli.inverse.incidence import on_entrance
 from caustic_cli.inverse.initial_surface import net_of
 from caustic_cli.inverse.internal_rays import internal_rays, interpolate_scattered
 from caustic_cli.inverse.projection import ScreenProjection
+from caustic_cli.inverse.scattered import Pixels
 from caustic_cli.inverse.surface_from_map import slopes_to, surface
 from caustic_cli.inverse.surface_from_slopes import fitted
 from caustic_cli.inverse.transport import cell_lines, corners, solve
@@ -38,16 +39,17 @@ from caustic_cli.scene.screen import Sags
 
 #: Samples per cell of the exit along each axis for the light of the picture there; most per pixel; smoothing, cells.
 PARTS, MOST_PARTS, SMOOTH = 6, 32, 0.7
-#: Alternating solutions for both surfaces; iterations for the intersection of a ray with the exit; fits of the first exit.
-REPEATS, HEIGHTS, FIRST_FITS = 3, 6, 2
+#: Alternating solutions for both surfaces, of which all but the last are on cells and knot spans coarser by a factor; iterations
+#: for the intersection of a ray with the exit; fits of the first exit.
+REPEATS, COARSER, HEIGHTS, FIRST_FITS = 3, 2, 6, 2
 #: Rays per control point for the fit of the exit.
 RAYS_A_CONTROL = 4
 #: Lower bound of a picture over its mean, for the transport between two pictures.
 DARKEST = 0.02
 #: Cells along each axis for the transport between two pictures, and most subdivisions of a pixel.
 PAIRED, CUT = 256, 2
-#: Cells along the lens' longer side: per pixel, at least and at most.
-A_PIXEL, CELLS = 2, (96, 512)
+#: Cells along the lens' longer side: per pixel, at least and at most; as many as knot spans if these are more.
+A_PIXEL, CELLS = 2, (96, 1024)
 #: Fraction of the light of the picture that may fall outside the aperture of the exit.
 BESIDE = 0.02
 
@@ -72,6 +74,16 @@ class PlanePicture:
         """Corners of pixels that are not black, (k + 1, l + 1) bool."""
         on = np.pad(self.light > 0, 1)
         return on[1:, 1:] | on[:-1, 1:] | on[1:, :-1] | on[:-1, :-1]
+
+    def pixels(self, ex: np.ndarray, ey: np.ndarray) -> Pixels:
+        """Its pixels, where their light leaves the exit: x and y there of the corners, mm, bilinear in between."""
+
+        def on_exit(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            at = [n * 0.5 * (c / h + 1.0) for c, n, h in zip((x, y), self.light.shape, self.half, strict=True)]
+            found = [map_coordinates(e, at, order=1, mode="nearest") for e in (ex, ey)]
+            return found[0], found[1]
+
+        return Pixels(self.light, self.half, on_exit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,31 +126,56 @@ def first_sides(
     Raises:
         InputError: light of the picture would come from outside the exit, or cannot be refracted there.
     """
-    lens, behind, thickness = scene.lens, scene.second_target, scene.lens.offset.thickness
+    behind, thickness = scene.second_target, scene.lens.offset.thickness
     assert behind is not None
     least, most = CELLS
-    grid = _CellGrid.of(lens.half_size, cells or min(most, max(least, A_PIXEL * max(target.shape))))
+    cells = cells or min(
+        most, max(least, A_PIXEL * max(target.shape), *(n - p for n, p in zip(field.shape, scene.lens.degree, strict=True)))
+    )
+    levels = [_level(scene, field, cells, COARSER)] * (REPEATS - 1) + [_level(scene, field, cells, 1)]
     near = PlanePicture(target, scene.screen.half_size, scene.screen.z, scene.screen.shift)
     if second is not None and behind.screen is not None:
         slopes = slopes_behind(near, PlanePicture(second, behind.screen.half_size, behind.screen.z, behind.screen.shift))
     else:
         slopes = slopes_towards(near, behind.focus)
     (px, py), lit = near.corners, near.lit
-    nets = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, thickness, dtype=torch.float64)])
-    light, directions = on_entrance(scene, grid.x, grid.y)
-    exit = np.full((len(grid.x), len(grid.y)), thickness)
-    for k in range(REPEATS):
+    flat = [torch.full(levels[0].field.shape, z, dtype=torch.float64) for z in (0.0, thickness)]
+    level, nets = levels[0], torch.stack(flat)
+    for k, now in enumerate(levels):
+        grid, exit = now.grid, now.grid.heights(level.field, nets[1])
         at = np.full(px.shape, thickness)
         for _ in range(HEIGHTS if k else 1):  # the first step is exact for a flat exit
             ex, ey = px - slopes[0] * (near.z - at), py - slopes[1] * (near.z - at)
             at = grid.at(exit, ex, ey)
         on_exit = _on_exit(near.light, ex, ey, grid)
         aim = interpolate_scattered(np.stack([ex[lit], ey[lit]]), np.stack([px[lit], py[lit]]), *grid.corners)
-        nets[0] = net_of(grid.x, grid.y, _entrance(scene, light, directions, on_exit, exit if k else None), field)
+        pixels = near.pixels(ex, ey) if k else None
+        entrance = net_of(grid.x, grid.y, _entrance(scene, now, on_exit, exit, pixels), now.field)
+        level, nets = now, torch.stack([entrance, net_of(grid.x, grid.y, exit, now.field)])
         for _ in range(1 if k else FIRST_FITS):
-            nets[1] = _exit(scene, field, nets, grid, aim)
-        exit = grid.heights(field, nets[1])
+            nets[1] = _exit(scene, level.field, nets, grid, aim)
     return nets
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Cells and spline spaces of both surfaces at a resolution, and the light of the source on the entrance's plane, see
+    `on_entrance`."""
+
+    grid: _CellGrid
+    field: HeightField
+    light: np.ndarray
+    directions: tuple | None
+
+
+def _level(scene: Scene, field: HeightField, cells: int, coarser: int) -> _Level:
+    """A level with cells and knot spans coarser by a factor."""
+    lens = scene.lens
+    if coarser > 1 and lens.knots is None:
+        control = [max(p + 1, -(-(n - p) // coarser) + p) for n, p in zip(field.shape, lens.degree, strict=True)]
+        field = HeightField.of(replace(lens, control=(control[0], control[1])))
+    grid = _CellGrid.of(lens.half_size, -(-cells // coarser))
+    return _Level(grid, field, *on_entrance(scene, grid.x, grid.y))
 
 
 def slopes_behind(near: PlanePicture, far: PlanePicture) -> tuple[np.ndarray, np.ndarray]:
@@ -166,32 +203,32 @@ def slopes_towards(near: PlanePicture, focus: tuple[float, float, float] | None)
     return (focus[0] - x) / (focus[2] - near.z), (focus[1] - y) / (focus[2] - near.z)
 
 
-def _entrance(
-    scene: Scene, light: np.ndarray, directions: tuple | None, on_exit: np.ndarray, exit: np.ndarray | None
-) -> np.ndarray:
+def _entrance(scene: Scene, level: _Level, on_exit: np.ndarray, exit: np.ndarray, pixels: Pixels | None) -> np.ndarray:
     """Heights of the entrance at the corners of the cells, from its plane, mm, for an irradiance on the exit.
 
     Args:
-        light, directions: on the plane of the entrance, see `on_entrance`.
-        on_exit: irradiance on the cells there, any unit; exit: heights of the exit at their corners, mm, None for a plane.
+        on_exit: irradiance on the cells there, any unit; exit: heights of the exit at their corners, mm.
+        pixels: of the picture, where their light leaves the exit; None for a flat exit.
     """
     lens = scene.lens
     z, half, centre, projection = lens.offset.thickness, lens.half_size, (0.0, 0.0), None
-    if exit is not None:
-        projection = ScreenProjection(Screen(lens.size, z, on_exit.shape, sags=Sags(exit - z, lens.size)), lens.z_in)
-        on_exit, half, centre = projection.projected_target(on_exit)
+    if pixels is not None and (to := pixels.project):
+        projection = seen = ScreenProjection(Screen(lens.size, z, on_exit.shape, sags=Sags(exit - z, lens.size)), lens.z_in)
+        on_exit, half, centre = seen.projected_target(on_exit)
+        pixels = replace(pixels, project=lambda x, y: seen.project(*to(x, y)), centre=centre)
     found = surface(
-        light,
+        level.light,
         on_exit,
         lens.half_size,
         half,
         1.0 / lens.index,
         z,
         lens.z_in,
-        directions,
+        level.directions,
         corrections=1,
         centre=centre,
         projection=projection,
+        pixels=pixels,
     )
     return found.heights - lens.z_in
 

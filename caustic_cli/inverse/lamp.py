@@ -313,11 +313,17 @@ class Aimed:
 
 
 def field_of(effort: Effort, pixels: int | None = None) -> PolarField:
-    """The spline spaces of a design, or of a stage with so many pixels: spans are halved until there are as many as pixels show."""
+    """The spline spaces of a stage with so many pixels, or the finest: spans are halved until there are as many as pixels show."""
     spans = effort.lamp_spans
     while pixels is not None and pixels < PER_SPAN * spans * spans:
         spans = spans // 2
     return PolarField.uniform((spans + DEGREE,) * 2, (DEGREE,) * 2)
+
+
+def final_field(lamp: Lamp, effort: Effort) -> PolarField:
+    """The spline spaces of a design."""
+    stages = stages_of(lamp, effort)
+    return field_of(effort, stages[-1][1][0] if stages else None)
 
 
 def refined(field: PolarField, values: Tensor, finer: PolarField) -> Tensor:
@@ -327,7 +333,8 @@ def refined(field: PolarField, values: Tensor, finer: PolarField) -> Tensor:
 
 
 def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Lamp, tuple[int, int, int, float]]]:
-    """The stages of a design, each with the lamp that it refines: the lamp itself, with one surface or with a point as its chip."""
+    """The stages of a design, each with the lamp that it refines: the lamp itself, with one surface or with a point as its chip; a
+    chip with an extent comes after those of fewer rays than its own."""
     point = replace(lamp, chip=lamp.chip.centre)
     if lamp.surfaces == 2:
         found = [(replace(point, surfaces=1), effort.lamp_stages[0]), *((point, stage) for stage in effort.two_stages)]
@@ -337,7 +344,8 @@ def stages_of(lamp: Lamp, effort: Effort) -> list[tuple[Lamp, tuple[int, int, in
         found = [(point, stage) for stage in effort.lamp_stages]
     if lamp.chip.shape == "point":
         return found
-    return [*found[:-1], *((lamp, stage) for stage in effort.chip_stages)]
+    stages = [(lamp, stage) for stage in effort.chip_stages]
+    return [*(one for one in found if one[1][1] < stages[0][1][1]), *stages]
 
 
 def judged_pixels(lamp: Lamp, goal: Goal, effort: Effort) -> tuple[int, int]:
@@ -356,7 +364,7 @@ def design_lamp(
     on_iteration: Callable[[int, int, float], None] = lambda stage, k, loss: None,
     on_stage: Callable[[int, PolarField, Tensor], None] = lambda done, field, values: None,
 ) -> Tensor:
-    """The surfaces that send the light of a chip to a picture: control values of r, mm, over the spline spaces `field_of`,
+    """The surfaces that send the light of a chip to a picture: control values of r, mm, over the spline spaces `final_field`,
     (n, m) of one or (2, n, m) of two (`optics.lamp.sides`).
 
     Args:
@@ -385,7 +393,6 @@ def design_lamp(
         objective = LampObjective(designed, goal, field, target, rays, weight)
         values = refine(objective, values, iterations, partial(on_iteration, k))
         on_stage(k + 1, field, values)
-    field, values = field_of(effort), refined(field, values, field_of(effort))
     if lamp.surfaces == 1 and lamp.flat is None:  # the light of one that is a little smaller is the same
         values = min(1.0, lamp.radius / field.extent(values)[1]) * values
     refuse_thin(lamp, field, values)

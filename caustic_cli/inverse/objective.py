@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from caustic_cli.inverse import ranks
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.loss_terms import PENALTIES, parse
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.inverse.schedule import LossImage
+from caustic_cli.optics import ranks
 from caustic_cli.optics.emission import Emission, Rays
 from caustic_cli.optics.memory import smaller_chunk
 from caustic_cli.optics.sampling import Sampler

@@ -72,8 +72,6 @@ class Stage:
     lenslets: bool = default("design.stages.lenslets")
     #: It is left out if a later stage can refine the wave image.
     spare: bool = default("design.stages.spare")
-    #: Of several free-form surfaces it moves the lens' exit alone.
-    exit_alone: bool = default("design.stages.exit_alone")
 
     def __post_init__(self):
         check_all("design.stages", self, "control", "rays", "iterations", "tolerance", "waves")

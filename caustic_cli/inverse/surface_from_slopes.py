@@ -24,7 +24,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 #: Regularisation parameter: weight of second differences relative to slopes of points of mean weight.
 SMOOTH = 1e-3
 #: Most iterations of conjugate gradients, and their relative tolerance.
-STEPS, ENOUGH = 80, 1e-4
+STEPS, ENOUGH = 40, 1e-4
 
 
 def fitted(

@@ -26,7 +26,7 @@ SHARP = 2e-2
 
 
 class TwoSidedObjective(Objective):
-    """The loss as a function of the heights of entrance and exit, (2, n, m) mm; in a scene with an entrance, of the exit alone.
+    """The loss as a function of the heights of entrance and exit, (2, n, m) mm.
 
     Args:
         scene: with a `second`; field: spline spaces of both sides; sampler: the rays, the same at every evaluation.
@@ -54,9 +54,6 @@ class TwoSidedObjective(Objective):
 
     def _see(self, traced: Tracer, parameters: Parameters) -> list[Tensor]:
         """For a single picture, the last is the sum of power times squared angle to the prescribed direction."""
-        if traced.fused is not None and not self.further:
-            images = [traced.expose(parameters, channel.screen, channel.how.filter) for channel in self.channels]
-            return [channel.pooled(image.image) for channel, image in zip(self.channels, images, strict=True)] + [images[0].leaving]
         states = traced(parameters)
         images = [traced.collect(states, channel.screen, channel.how.filter) for channel in self.channels]
         found = [channel.pooled(image.image) for channel, image in zip(self.channels, images, strict=True)] + [images[0].leaving]
@@ -65,9 +62,7 @@ class TwoSidedObjective(Objective):
         return found
 
     def _penalty(self, parameters: Parameters) -> Tensor:
-        """Penalties of the surfaces that are designed, each from outside the glass."""
-        if ENTRANCE not in parameters:
-            return self.penalty(parameters[EXIT])
+        """Penalties of both surfaces, each from outside the glass."""
         return self.penalty(parameters[EXIT]) + self.penalty(self.penalty.base - parameters[ENTRANCE])
 
     def _loss(self, seen: list[Tensor], sums: list[Tensor], penalty: Tensor, entering: Tensor) -> Tensor:

@@ -20,11 +20,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from caustic_cli.inverse import ranks
 from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.objective import Evaluation, penalty_of
 from caustic_cli.inverse.schedule import LossImage
+from caustic_cli.optics import ranks
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.image import with_colour
 from caustic_cli.optics.surfaces import HeightField

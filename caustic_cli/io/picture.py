@@ -46,9 +46,11 @@ def to_srgb(value: np.ndarray) -> np.ndarray:
 
 
 def _disc() -> np.ndarray:
-    """A uniform disc, 1 where the centre of a pixel lies within it, else 0."""
-    x = (np.arange(DISC) + 0.5) / DISC - 0.5
-    return (x[:, None] ** 2 + x[None, :] ** 2 <= 0.25).astype(np.float64)
+    """A uniform disc: the part of each pixel that lies within it, by DISC_POINTS^2 points."""
+    n = DISC * DISC_POINTS
+    x = (np.arange(n) + 0.5) / n - 0.5
+    within = x[:, None] ** 2 + x[None, :] ** 2 <= 0.25
+    return within.reshape(DISC, DISC_POINTS, DISC, DISC_POINTS).mean((1, 3))
 
 
 def _headlamp() -> np.ndarray:
@@ -61,6 +63,8 @@ def _headlamp() -> np.ndarray:
 #: Pictures by name, where there is no such file: a uniform rectangle, a disc and a passing beam; pixels across the latter two, and
 #: height of the cut-off, 1 being the upper edge.
 NAMED, DISC, CUT_OFF = {"uniform": lambda: np.ones((2, 2)), "disc": _disc, "headlamp": _headlamp}, 500, 0.8
+#: Points of a pixel of the disc along both axes.
+DISC_POINTS = 8
 #: Name of one that follows from where a lamp throws it, see `project.road_target`.
 ROAD = "road"
 

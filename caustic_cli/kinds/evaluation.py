@@ -29,7 +29,7 @@ beams = OnDemand("caustic_cli.studies.beam")
 LIKENESS = {"rms", "rms-light", "throughput"}
 #: Ratio of the light on the screen from which a lens is kept although the initial surface has a smaller error.
 BRIGHTER = 1.01
-#: Ratio of the errors by waves from which few wavelengths tell that the initial surface is worse.
+#: Ratio of the errors by waves from which one at few wavelengths tells that the initial surface is worse.
 CLEARLY = 1.5
 
 
@@ -116,10 +116,12 @@ class LensEvaluation:
         self.figures |= beams.shaped_figures(*how, seen)
 
     @property
-    def few(self) -> tuple[float, ...]:
-        """Wavelengths of the design, nm, which tell an image that is clearly worse; empty where the verdict has no others."""
-        by_waves = [stage.waves for stage in self.designer.stages if stage.waves]
-        return by_waves[-1] if self.light is not None and self.light.halves is not None and by_waves else ()
+    def start_by_waves(self) -> float:
+        """Error of the initial surface by waves, at other wavelengths than the design's, measured when its objective was
+        ready; 0 where it was not."""
+        rows, history, stages = self.state.accuracy, self.state.history, self.designer.stages
+        by_waves = bool(history) and stages[history[0][1]].waves and stages[-1].rendering.bright is None
+        return rows[0].error if by_waves and rows and rows[0].iteration == 0 else 0.0
 
     def compare_with_start(self) -> None:
         """Keep the initial surface if it is better, where the loss measures the error of the picture alone."""
@@ -130,8 +132,9 @@ class LensEvaluation:
         heights = problem.feasible(state.stage, self.designer.initial_surface(state))
         # other light has an estimate of the noise anyway
         noise, figures = not problem.scene.source.parallel or state.unrounded is not None, self.figures
-        _, light, initial = self.see(heights, noise, self.few)
-        if self.few and not (initial["wave_relative_rms"] or 0.0) > CLEARLY * figures["wave_relative_rms"]:
+        if self.light is not None and (known := self.start_by_waves) > CLEARLY * figures["wave_relative_rms"]:
+            light, initial = None, self.rays(heights, noise)[1] | {"wave_relative_rms": known}
+        else:
             _, light, initial = self.see(heights, noise)
         # rays of a lens that was refined on its wave image say nothing of it once there is none
         lost = figures["no_wave_image"] if self.light is None and light is not None else ""
@@ -149,7 +152,7 @@ class LensEvaluation:
                 self.state = replace(state, reason=f"{state.reason}; {why}")
         self.initial = initial
         self.figures = figures | {
-            "start_error": judged(initial, self.refined)["error"],
+            "start_error": initial[_keys(initial, initial)[0]],
             "start_relative_rms": initial["relative_rms"],
         }
         if initial["noise"] is not None:

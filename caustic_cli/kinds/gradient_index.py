@@ -9,10 +9,10 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from caustic_cli.config.default_stages import refinement, transport_cells
 from caustic_cli.config.settings import Settings
@@ -31,8 +31,6 @@ RAYS_BENT, ITERATIONS = 16, 24  # largest number of rays per pixel, since they c
 class IndexPlate(OneSurface):
     """A plate with a designed index; its surface is flat."""
 
-    no_movie = "⟨movie⟩ records the design of a surface; ⟨lens.gradient⟩ free designs the index"
-    no_resume = "⟨lens.gradient⟩ free cannot be resumed: design it anew, with more ⟨iterations⟩"
     in_stages = False
 
     @classmethod
@@ -74,35 +72,40 @@ class IndexPlate(OneSurface):
     def iterate(
         self,
         lens: LensSettings,
-        iterations: int,
+        state: State,
+        total: int,
         began: float,
         time_limit: float,
         stop: Callable[[], bool],
-        show: Callable[..., None],
+        on_iteration: Callable[[State], None],
     ) -> tuple[np.ndarray, State]:
         """Design the index of the plate: its control values, and the final state.
 
         Args:
-            lens: the [lens] section; iterations: in total, 0 for those of the stage.
+            lens: the [lens] section; state: the initial one, after whose iterations the index is that of the lens.
+            total: iterations, with those.
             began: start of the command by `time.monotonic`; time_limit: of the command, s, of which two thirds are for the
                 iterations and the rest for the evaluation.
-            stop: called before every iteration; show: progress.
+            stop: called before every iteration; on_iteration: after.
 
         Raises:
             InputError: as of `design_gradient_index`.
         """
         stage, target = self.stages[-1], self.target.numpy()
-        total = iterations or stage.iterations
         limit = time_limit if math.isinf(time_limit) else 2.0 * time_limit / 3.0
-        rows: list[tuple[int, int, float, float, float]] = []
+        flat = torch.full(lens.control, float(self.scene.lens.offset.thickness), dtype=torch.float64)
+        before, now = state.seconds, State(flat, total=state.total, iteration=state.total, history=list(state.history))
 
         def late() -> bool:
             return time.monotonic() - began > limit
 
-        def on_iteration(k: int, loss: float, on_screen: float, _image: Any) -> None:
-            rows.append((k, 0, loss, on_screen, time.monotonic() - began))
-            show("index", f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", k, total)
+        def done(k: int, loss: float, on_screen: float, image: Tensor | None) -> None:
+            now.total = now.iteration = state.total + k
+            now.seconds, now.image = before + time.monotonic() - began, image
+            now.history.append((now.total, 0, loss, on_screen, now.seconds))
+            on_iteration(now)
 
+        designed = self.scene.lens.gradient if state.total else None
         blank = replace(self.scene, lens=replace(self.scene.lens, gradient=None))
         design = design_gradient_index(
             blank,
@@ -111,26 +114,20 @@ class IndexPlate(OneSurface):
             lens.index_layers,
             lens.index_range,
             cells=transport_cells(stage.rays, False, least=self.effort.source_cells),
-            iterations=total,
+            iterations=max(0, total - state.total),
             rays=stage.rays,
             seed=self.options.seed,
-            on_iteration=on_iteration,
+            begin=None if designed is None else designed.volume,
+            on_iteration=done,
             stop=lambda: stop() or late(),
         )
-        done = len(rows)
-        reason = (
-            "interrupted"
-            if stop()
-            else "time limit"
-            if late() and done < total
-            else "iterations"
-            if done == total
-            else "no progress"
-        )
-        flat = torch.full(lens.control, float(self.scene.lens.offset.thickness), dtype=torch.float64)
-        seconds = rows[-1][-1] if rows else 0.0
-        state = State(flat, iteration=done, total=done, history=rows, seconds=seconds, reason=reason)
-        return design.index.coefficients.numpy(), state
+        if stop():
+            now.reason = "interrupted"
+        elif now.total >= total:
+            now.reason = "iterations"
+        else:
+            now.reason = "time limit" if late() else "no progress"
+        return design.index.coefficients.numpy(), now
 
     def words(self, lens: LensSettings) -> str:
         """What is designed, before it is."""

@@ -108,14 +108,10 @@ class Ahead(NamedTuple):
 class OneSurface(Problem):
     """One free-form surface, on rays and on the wave image, under any source."""
 
-    #: Why the optimisation cannot be recorded or resumed; "" where it can.
-    no_movie = no_resume = ""
     #: Whether the optimisation is that of the stage loop; otherwise the kind brings its own, `iterate`.
     in_stages = True
     #: Whether the thickness and the range of the heights may be adapted to the initial surface.
     adapts = True
-    #: Whether other surfaces are designed together with the exit.
-    has_others = False
     #: The objective of a stage on the wave image, made in order to leave out stages on rays before it.
     _ahead: Ahead | None = None
     #: The stage on the wave image that runs, or the last that did, and its objective.
@@ -281,8 +277,6 @@ class OneSurface(Problem):
         super().check()
         if any(stage.lenslets and not self.takes_lenslets(k) for k, stage in enumerate(self.stages)):
             raise InputError("⟨design.stages.lenslets⟩ needs ⟨lens.array⟩, and neither waves nor spread in the same stage")
-        if any(stage.exit_alone for stage in self.stages) and not self.has_others:
-            raise InputError("⟨design.stages.exit_alone⟩ needs other free-form surfaces beside the exit")
         if not self.options.parametrisation.free and any(s.waves for s in self.stages):
             raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -74,14 +73,7 @@ class TwoSides(SeveralSurfaces):
         cls.complete_control(d)
         d.fill_design(preconditioner="laplacian")
         if not d.complete_given_stages():
-            together, exit = d.effort.system, d.effort.exit_alone
-            if d.own_control or exit is None:
-                return d.set_stages(refinement(d.lens.control, d.rays, d.resolution, together))
-            coarse = (d.lens.control[0], d.lens.control[1])
-            fine = [exit.spans(max(d.resolution)) + p for p in d.lens.degree]
-            d.set_control(fine)
-            alone = refinement((fine[0], fine[1]), d.rays, d.resolution, exit)
-            d.set_stages(refinement(coarse, d.rays, d.resolution, together) + [stage | {"exit_alone": True} for stage in alone])
+            d.set_stages(refinement(d.lens.control, d.rays, d.resolution, d.effort.sides))
         elif any(stage.get(key) for stage in d.design.stages for key in ("waves", "spread")):
             raise InputError(
                 "[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread"
@@ -89,7 +81,7 @@ class TwoSides(SeveralSurfaces):
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:
-        return [d.effort.system.spans(max(d.resolution)) + p for p in d.lens.degree]
+        return [d.effort.sides.spans(max(d.resolution)) + p for p in d.lens.degree]
 
     @property
     def half_sizes(self) -> list[tuple[float, float]]:
@@ -101,19 +93,13 @@ class TwoSides(SeveralSurfaces):
         return torch.stack([-most, low]), torch.stack([most, high])
 
     def parametrised(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
-        if start is None or self.stages[k].exit_alone:
+        if start is None:
             return super().parametrised(k, start, loaded)
         light = None if loaded else entrance_points(self.scene, self.field(k), start)
         laplacian = self.options.parametrisation.preconditioner == "laplacian"
         return SidesTogether(*self.bounds(k), start, laplacian, light)
 
-    def of_exit(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
-        """Without the directions of the light, which the entrance decides: moving light by a part of a pixel hardly turns it."""
-        if self.second_target is None:
-            return super().of_exit(replace(scene, second_target=None), k, initial)
-        return self.together(scene, k, initial)
-
-    def together(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
+    def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         stage, o, scene = self.stages[k], self.options, self.lit(scene, k)
         targets = (self.target,) if self.second_target is None else (self.target, self.second_target)
         rays = rays_of(scene, stage.sampler, stage.rays, self.seed(k), self.device)

@@ -10,7 +10,9 @@ or a refined one in which knot insertion reproduces the same surface.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -62,7 +64,7 @@ def refined(field: HeightField, heights: Tensor, shortest: float) -> tuple[Heigh
 
 def _carried(coarse: SplineSpace, finer: SplineSpace):
     """Change of basis by interpolation at the finer space's Greville abscissae, exact for splines of the coarser space."""
-    solve, values = _interpolation(finer), _collocation(coarse, finer.greville)
+    solve, values = _Interpolation(finer), _collocation(coarse, finer.greville)
     return lambda net: solve(values @ net)
 
 
@@ -73,9 +75,21 @@ def _collocation(space: SplineSpace, at: Tensor) -> sparse.csr_array:
     return sparse.csr_array((values.numpy().ravel(), (rows, columns.ravel())), shape=(len(at), space.n))
 
 
-def _interpolation(space: SplineSpace):
+@dataclass(frozen=True)
+class _Interpolation:
     """A function: values at the Greville abscissae (n, ...) -> control heights."""
-    return linalg.splu(sparse.csc_matrix(_collocation(space, space.greville))).solve
+
+    space: SplineSpace
+
+    @cached_property
+    def _solve(self) -> Callable[[np.ndarray], np.ndarray]:
+        return linalg.splu(sparse.csc_matrix(_collocation(self.space, self.space.greville))).solve
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        return self._solve(values)
+
+    def __reduce__(self) -> tuple:  # SciPy's factors cannot be pickled
+        return _Interpolation, (self.space,)
 
 
 class OtherSurfaces:
@@ -131,7 +145,7 @@ class FormErrors:
     def __init__(self, field: HeightField, form: FormError | None, waviness: Waviness | None):
         self.field, self.waviness, self.modes = field, waviness, None
         self.x, self.y = (c.numpy() for c in field.control_xy())
-        self.solve = tuple(_interpolation(s) for s in field.spaces)
+        self.solve = tuple(_Interpolation(s) for s in field.spaces)
         if form is not None and form.rms > 0:
             self.modes = self._modes(form)
 

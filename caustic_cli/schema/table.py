@@ -501,8 +501,6 @@ class StageSettings(Section):
             default=False, written=False)
     lenslets: bool = setting("array: compare the image of every lenslet with its own picture, with its share of the rays",
             default=False, written=False)
-    exit_alone: bool = setting("several free-form surfaces: move the lens' exit alone, the others as the stage before left them",
-            default=False, written=False)
     spare: bool = setting("leave this stage out if a later one can refine the wave image", default=False, written=False)
     oversample: int = setting("subdivide pixels for the filter by this factor, and sum them: sharper than the filter on pixels",
             low=1, high=8, default=1)

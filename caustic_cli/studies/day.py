@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta, tzinfo
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,6 +37,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import SOFTWARE, atomic_file
+from caustic_cli.optics import ranks
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.misalignment import Misalignment, landing_points
@@ -385,19 +386,23 @@ def follow_day(
 
     def look(times: Iterable[datetime], why: str) -> None:
         todo = [t for t in times if t not in found]
-        for k, time in enumerate(todo):
-            progress(f"{why}, {time:%H:%M}", k, len(todo))
-            try:
-                seen = follower.at(time)
-            except InputError:  # there is no picture in the plane of the screen
-                continue
-            found[time] = seen.instant, keep(seen)
+        seen = ranks.mapped(partial(_seen, follower, keep), todo, lambda done: progress(why, done, len(todo)))
+        found.update((time, one) for time, one in zip(todo, seen, strict=True) if one is not None)
 
     look(_every(shines, STEP), "the sun's day")
     if not found:
         raise InputError("⟨day⟩ needs light on the plane of the screen, and there is none at any time of that day")
     look(_between(Day(follower.error, follower.bounds, _sorted(found)), shines), "while the picture is on the screen")
     return Day(follower.error, follower.bounds, _sorted(found)), [found[time][1] for time in sorted(found)]
+
+
+def _seen(follower: Follower | SundialFollower, keep: Callable[[Looked], T], time: datetime) -> tuple[Instant, T] | None:
+    """What is seen at a time, None where there is no picture in the plane of the screen."""
+    try:
+        seen = follower.at(time)
+    except InputError:
+        return None
+    return seen.instant, keep(seen)
 
 
 def _sorted(found: dict[datetime, tuple[Instant, Any]]) -> tuple[Instant, ...]:

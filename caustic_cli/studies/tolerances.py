@@ -30,6 +30,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -41,6 +42,7 @@ from torch import Tensor
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import CREATED_BY, SOFTWARE, atomic_file, write_bytes
+from caustic_cli.optics import ranks
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
@@ -271,17 +273,8 @@ class Sensitivity:
 
 def sensitivities(trials: Trials, progress: Callable[[int], None] = lambda done: None) -> list[Sensitivity]:
     """Sensitivities to all errors, the largest contribution first."""
-    found, square = [], trials.evaluate({}).relative_rms ** 2  # with the same rays, so that the noise cancels in differences
-    for p in trials.parameters:
-        pairs = [trials.images({(p.error, p.axis): sign * p.sigma}) for sign in (-1.0, 1.0)]
-        below, above = (trials.figures_of(*pair) for pair in pairs)
-        slopes = [_slope(pairs[0][half], pairs[1][half], p.sigma) for half in (0, 1)]
-        derivative = math.sqrt(max(0.0, float(np.mean(slopes[0] * slopes[1]))))
-        adds = 0.5 * (below.relative_rms**2 + above.relative_rms**2) - square
-        found.append(
-            Sensitivity(p.name, p.unit, p.sigma, derivative, below.relative_rms, above.relative_rms, math.sqrt(max(0.0, adds)))
-        )
-        progress(len(found))
+    square = trials.evaluate({}).relative_rms ** 2  # with the same rays, so that the noise cancels in differences
+    found = ranks.mapped(partial(_sensitivity, trials, square), trials.parameters, progress)
     first = ALONE if len(trials.tolerances.surface) > 1 else 0  # a single error has the realisations of the first draws
     for name in trials.tolerances.surface:
         errors = [trials.evaluate({}, first + k, (name,)).relative_rms for k in range(REALISATIONS)]
@@ -291,6 +284,17 @@ def sensitivities(trials: Trials, progress: Callable[[int], None] = lambda done:
         found.append(Sensitivity(name, "mm", sigma, None, mean, mean, math.sqrt(max(0.0, mean**2 - square))))
         progress(len(found))
     return sorted(found, key=lambda s: -s.adds)
+
+
+def _sensitivity(trials: Trials, square: float, p: Parameter) -> Sensitivity:
+    """Sensitivity to a parameter; square: F_0^2."""
+    with one_thread():
+        pairs = [trials.images({(p.error, p.axis): sign * p.sigma}) for sign in (-1.0, 1.0)]
+        below, above = (trials.figures_of(*pair) for pair in pairs)
+    slopes = [_slope(pairs[0][half], pairs[1][half], p.sigma) for half in (0, 1)]
+    derivative = math.sqrt(max(0.0, float(np.mean(slopes[0] * slopes[1]))))
+    adds = 0.5 * (below.relative_rms**2 + above.relative_rms**2) - square
+    return Sensitivity(p.name, p.unit, p.sigma, derivative, below.relative_rms, above.relative_rms, math.sqrt(max(0.0, adds)))
 
 
 def _slope(low: np.ndarray, high: np.ndarray, sigma: float) -> np.ndarray:
@@ -336,14 +340,22 @@ def study(trials: Trials, progress: Callable[[str, int, int], None] = lambda wha
     nominal = trials.nominal()
     kinds = len(trials.parameters) + len(t.surface)
     alone = sensitivities(trials, lambda done: progress("sensitivities", done, kinds))
-    drawn, judged = hypercube(trials.parameters, t.draws, t.seed), []
-    for number, row in enumerate(drawn):
-        values = {(p.error, p.axis): float(v) for p, v in zip(trials.parameters, row, strict=True)}
-        judged.append(trials.evaluate(values, number))
-        progress("draws", number + 1, t.draws)
+    drawn = hypercube(trials.parameters, t.draws, t.seed)
+    judged = ranks.mapped(partial(_drawn, trials, drawn), range(len(drawn)), lambda done: progress("draws", done, t.draws))
     at = int(np.argsort([j.relative_rms for j in judged])[math.ceil(0.95 * len(judged)) - 1])
-    checked = trials.check({(p.error, p.axis): float(v) for p, v in zip(trials.parameters, drawn[at], strict=True)}, at)
+    checked = trials.check(_values(trials, drawn[at]), at)
     return Study(trials.parameters, drawn, tuple(judged), nominal, tuple(alone), unused, trials.by, t.seed, checked)
+
+
+def _values(trials: Trials, row: np.ndarray) -> Values:
+    """Errors by (name, axis) of a draw (k,)."""
+    return {(p.error, p.axis): float(v) for p, v in zip(trials.parameters, row, strict=True)}
+
+
+def _drawn(trials: Trials, drawn: np.ndarray, number: int) -> TrialFigures:
+    """Figures of a draw by its number."""
+    with one_thread():
+        return trials.evaluate(_values(trials, drawn[number]), number)
 
 
 def percentile_error(values: np.ndarray, part: float) -> float:
@@ -361,11 +373,11 @@ def offenders(found: Study) -> list[dict]:
     worst = np.argsort(error)[-max(1, math.ceil(WORST * len(error))) :]
     rows = []
     for p, column in zip(found.parameters, np.abs(found.drawn).T, strict=True):
-        ranks = [np.argsort(np.argsort(c)) for c in (column, error)]
+        orders = [np.argsort(np.argsort(c)) for c in (column, error)]
         rows.append(
             {
                 "name": p.name,
-                "correlation": float(np.corrcoef(*ranks)[0, 1]),
+                "correlation": float(np.corrcoef(*orders)[0, 1]),
                 "in_worst": float(column[worst].mean() / p.sigma),
             }
         )

@@ -130,7 +130,8 @@ def corrected_heights(project: Project, lens: Lens, judged: Judged, device: str)
 def predicted(lens: Lens, judged: Judged, heights: Tensor) -> dict[str, Any]:
     """Predicted errors of the picture of the part as it is and of a part of H', each with its standard deviation: registered and in
     the frame of the screen; gain and its standard deviation, of registered errors; and how far H' is from H, RMS in µm.  Light of
-    the photograph that the fit does not explain may be of the part: it counts as uncertainty."""
+    the photograph that the fit does not explain may be of the part: it counts as uncertainty, and as many times as the error of a
+    part is larger than its picture, since a caustic that has folded is explained by other surfaces, too."""
     known = judged.before.deviation if judged.before is not None else torch.zeros_like(lens.heights)
 
     def errors(sent: Tensor, guess: Guess) -> tuple[float, float]:
@@ -142,7 +143,7 @@ def predicted(lens: Lens, judged: Judged, heights: Tensor) -> dict[str, Any]:
     moved = heights - lens.heights
 
     fit, seen = judged.found.fits[0], judged.shown[0].irradiance
-    unexplained = math.sqrt(max(0.0, 1.0 - fit.explained)) * float(seen.std() / seen.mean())
+    unexplained = math.sqrt(max(0.0, 1.0 - fit.explained)) * float(seen.std() / seen.mean()) * max(1.0, float(now[:, 0].mean()))
 
     def both(values: np.ndarray) -> list[float]:
         return [float(values.mean()), math.hypot(float(values.std(ddof=1)), unexplained)]

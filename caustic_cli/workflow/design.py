@@ -22,9 +22,8 @@ import torch
 
 from caustic_cli import __version__
 from caustic_cli.config import settings
-from caustic_cli.config.settings import Given
+from caustic_cli.config.settings import Given, Settings
 from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
-from caustic_cli.inverse import ranks
 from caustic_cli.inverse.accuracy_cost import CostOfAccuracy, Start, as_table
 from caustic_cli.inverse.designer import Designer, InitialHeights, State
 from caustic_cli.inverse.reachability import largest_magnification
@@ -32,10 +31,11 @@ from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture
-from caustic_cli.kinds import OneSurface, kind_of, problem_of
+from caustic_cli.kinds import OneSurface, problem_of
 from caustic_cli.kinds.evaluation import Evaluated
 from caustic_cli.kinds.surface import PLATE, WALL
 from caustic_cli.loading import OnDemand
+from caustic_cli.optics import ranks
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights, trace_arguments
 from caustic_cli.project import attachments, directory, uptodate
@@ -90,7 +90,6 @@ def prepare(
     config: Path | None = None,
     out: Path | None = None,
     force: bool = False,
-    recorded: bool = False,
     say: Reporter,
     device: str = "cpu",
 ) -> PreparedDesign:
@@ -103,21 +102,18 @@ def prepare(
         preset: a name of `config.presets`, whose settings are overridden by those of config.
         config: a TOML file of further settings, which are overridden by those `given`.
         out: the directory; None for a design in memory.
-        force: replace a project there; recorded: whether a movie of the design is to be made.
+        force: replace a project there.
         device: of the design, whose kernels are compiled after the validation.
 
     Raises:
         InputError: invalid input; nothing was written.
     """
     project, said = new_project(target, given, preset, config, out, say.say)
-    kind = kind_of(project.settings)
-    if recorded and kind.no_movie:
-        raise InputError(kind.no_movie)
     if out is not None and not force:
         if same := uptodate.same_design(out, project.asked):
             return PreparedDesign(replace(same[0], checkpoint=same[1]))
         force = uptodate.is_begun(out, project.asked)  # and interrupted before the first checkpoint: it is begun anew
-    problem = kind.of(project, device)  # builds and thereby validates scene, target, stages, options
+    problem = problem_of(project, device)  # builds and thereby validates scene, target, stages, options
     problem.refuse_obstructed()
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
@@ -202,10 +198,10 @@ def design(
         return _again(project, device, say, began, movie, goal)
     with project.hold:
         _compile(problem, say)
-        if not problem.in_stages:
-            return _run_index(project, problem, say, began)
-        _say_limits(project, problem, first, say)
-        return _run(project, problem, Designer(problem).initial_state(*first or ()), say, began, None, movie, goal)
+        state = Designer(problem).initial_state(*first or ())
+        if problem.in_stages:
+            _say_limits(project, problem, first, say)
+        return _run(project, problem, state, say, began, None, movie, goal)
 
 
 def _again(project: Project, device: str, say: Reporter, began: Start, movie: NoMovie, goal: float) -> Result:
@@ -213,21 +209,8 @@ def _again(project: Project, device: str, say: Reporter, began: Start, movie: No
     figures = uptodate.finished(project, project.checkpoint)
     if figures and figures["reason"].startswith(REACHED) and not figures["error"] <= goal:
         figures = {}  # it ended for a larger error
-    anew = kind_of(project.settings).no_resume
-    say.say(
-        f"{project.path}: was designed from the same picture with the same options, so "
-        + (
-            "there is nothing to do; ⟨force⟩ designs it anew"
-            if figures
-            else "it is designed again"
-            if anew
-            else "it continues from its checkpoint"
-        )
-    )
-    if not figures and anew:
-        project.hold.enter_context(directory.locked(project.path))
-        project = replace(project, asked=uptodate.asked_of(project, project.checkpoint), checkpoint=None)
-        return design(PreparedDesign(project, problem_of(project, device)), device, say, began)
+    rest = "there is nothing to do; ⟨force⟩ designs it anew" if figures else "it continues from its checkpoint"
+    say.say(f"{project.path}: was designed from the same picture with the same options, so {rest}")
     if not figures:
         return resume(project, None, None, device, say, began, movie, goal)
     movie.unused(say)
@@ -263,8 +246,6 @@ def resume(
 ) -> Result:
     """Continue from the last checkpoint; with nothing left to do, evaluate the lens again."""
     with project.hold:
-        if words := kind_of(project.settings).no_resume:
-            raise project.error(words)
         refuse_corrected(project.path)
         project.hold.enter_context(directory.locked(project.path))
         problem = problem_of(project, device)
@@ -315,13 +296,16 @@ def _refuse_edited(project: Project, designer: Designer, state: State) -> None:
         )
 
 
-def follow(device: str) -> None:
-    """Main loop of all ranks but the first: run each design it sends, without reading or writing files."""
-    with _signals():  # handled by the first rank
-        while task := ranks.receive():
-            *parts, state, limit = task
-            project = Project(None, *parts)
-            Designer(problem_of(project, device)).run(state, iterations=project.settings.design["iterations"], time_limit=limit)
+def follow() -> None:
+    """Main loop of all ranks but the first, whose signals the first handles."""
+    with _signals():
+        ranks.serve()
+
+
+def _joined(settings: Settings, picture: Picture, state: State, limit: float, device: str) -> None:
+    """Run a design together with the first rank, without reading or writing files."""
+    problem = problem_of(Project(None, settings, picture), device)
+    Designer(problem).run(state, iterations=settings.design.iterations, time_limit=limit)
 
 
 def _on_cpu(state: State) -> State:
@@ -448,9 +432,13 @@ class _Watch:
         _, _, loss, on_screen, _ = now.history[-1]
         self.show(name, f"loss {loss * grey(self.target).size:.4f}  on screen {on_screen:.1%}", now.total, self.total)
         self.movie.record(now, self.target, self.encoding, bool(stage.waves))
+        self.measure_if_due(now)
+        self.keep_if_due(now)
+
+    def measure_if_due(self, now: State) -> None:
+        """Measure the error of the lens if this iteration is one of those planned."""
         if now.total in self.cost.due:
             self.measure(now)
-        self.keep_if_due(now)
 
     def keep_if_due(self, now: State) -> None:
         """Write a checkpoint if the last one is old enough."""
@@ -470,6 +458,8 @@ def _run(
     movie: NoMovie = NO_MOVIE,
     goal: float = 0.0,
 ) -> Result:
+    if not problem.in_stages:
+        return _run_index(project, problem, state, say, began, time_limit, movie)
     chosen, designer = project.settings.design, Designer(problem)
     limit = chosen.time_limit if time_limit is None else time_limit
     timed = math.isfinite(limit)
@@ -481,15 +471,15 @@ def _run(
     prepare_report(project, designer)
     with announce_compilation(say, COMPILING), _signals(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
-            watch.measure(state)
             records.keep(state)
-            ranks.send((project.settings, project.picture, _on_cpu(state), limit))
+            ranks.send(partial(_joined, project.settings, project.picture, _on_cpu(state), limit, problem.device))
             state = designer.run(
                 state,
                 iterations=chosen.iterations,
                 time_limit=limit,
                 stop=lambda: bool(asked) or watch.reaches(goal),
                 on_iteration=watch,
+                on_objective=watch.measure_if_due,
                 notice=say.say,
             )
             if not asked and watch.reaches(goal):
@@ -521,23 +511,37 @@ def _run(
     return result
 
 
-def _run_index(project: Project, problem: OneSurface, say: Reporter, began: Start) -> Result:
+def _run_index(
+    project: Project, problem: OneSurface, state: State, say: Reporter, began: Start, time_limit: float | None, movie: NoMovie
+) -> Result:
     """Design a free gradient index, evaluate and save it."""
-    chosen, lens = project.settings.design, project.settings.lens
+    chosen, lens, target = project.settings.design, project.settings.lens, problem.target.numpy()
+    total, limit = chosen.iterations or problem.stages[-1].iterations, chosen.time_limit if time_limit is None else time_limit
+    movie.begin(problem.scene)
     with _signals(project.path is not None) as asked:
         say.say(problem.words(lens))
-        with say.progress(chosen.iterations or problem.stages[-1].iterations) as show:
-            values, state = problem.iterate(lens, chosen.iterations, began.wall, chosen.time_limit, lambda: bool(asked), show)
+        with say.progress(total) as show:
+
+            def on_iteration(now: State) -> None:
+                _, _, loss, on_screen, _ = now.history[-1]
+                show("index", f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", now.total, total)
+                movie.record(now, target, project.settings.target.encoding, False)
+
+            values, state = problem.iterate(lens, state, total, began.wall, limit, lambda: bool(asked), on_iteration)
         lens = lens.changed(index_file=attachments.index_attached(values))
         project = replace(project, settings=project.settings.changed(lens=lens))
         if project.path is not None:
             project.write()
         designer = Designer(problem_of(project, problem.device))
-        evaluated = evaluate_and_write(project, designer, state, math.isfinite(chosen.time_limit))
+        evaluated = evaluate_and_write(project, designer, state, math.isfinite(limit))
         figures = {"index_least": float(np.min(values)), "index_most": float(np.max(values))}
         result = _finished(project, designer, evaluated, figures, began, _Records(project, designer))
+        result = replace(result, figures=result.figures | movie.finish(evaluated.shown, evaluated.figures, say))
         if asked:
-            raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is complete", 128 + asked[0])
+            continues = f"caustic design ⟨resume⟩ {project.path} continues it"
+            raise Interrupted(
+                f"interrupted after {state.total} iterations; {project.path} is complete, {continues}", 128 + asked[0]
+            )
     return result
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics import finishing
+from caustic_cli.optics import finishing, ranks
 from caustic_cli.optics.finishing import Relief
 from caustic_cli.optics.scattering import scattered
 from caustic_cli.scene import Scene
@@ -143,19 +143,21 @@ def compared(lens: Lens, finishes: tuple[str, ...] | None = None) -> list[Mappin
     """The lens as designed, and each finish, those of LADDER unless given, with its error and those for the weaker and the stronger
     end of what is known of it: finish, error, low, high, error_by, slope_rms, and scattered, the fraction of light that roughness
     scatters; or why, where the lens cannot be finished so."""
-    rows: list[Mapping[str, Any]] = [{"finish": "as designed", **judged(lens), "slope_rms": 0.0, "scattered": 0.0}]
-    for finish in finishes or LADDER:
-        part = Workpiece(lens, finish)
-        try:
-            now = part.finished()
-        except InputError as error:
-            rows.append({"finish": finish, "error": None, "error_by": None, "why": str(error)})
-            continue
-        figures = judged(now)
-        errors = sorted(e for e in (figures["error"], *part.unsure()) if e is not None) or [None]
-        more = {"low": errors[0], "high": errors[-1], "slope_rms": deviation(now, lens)["slope_rms"]}
-        rows.append({"finish": finish, **figures, **more, "scattered": part.scattered})
-    return rows
+    own: Mapping[str, Any] = {"finish": "as designed", **judged(lens), "slope_rms": 0.0, "scattered": 0.0}
+    return [own, *ranks.mapped(partial(_compared, lens), finishes or LADDER)]
+
+
+def _compared(lens: Lens, finish: str) -> Mapping[str, Any]:
+    """A row of `compared`."""
+    part = Workpiece(lens, finish)
+    try:
+        now = part.finished()
+    except InputError as error:
+        return {"finish": finish, "error": None, "error_by": None, "why": str(error)}
+    figures = judged(now)
+    errors = sorted(e for e in (figures["error"], *part.unsure()) if e is not None) or [None]
+    more = {"low": errors[0], "high": errors[-1], "slope_rms": deviation(now, lens)["slope_rms"]}
+    return {"finish": finish, **figures, **more, "scattered": part.scattered}
 
 
 def needed(rows: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

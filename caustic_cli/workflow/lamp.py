@@ -25,7 +25,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.lamp_mitsuba import FINE, plane_of, write_lamp_mitsuba
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
-from caustic_cli.inverse.lamp import design_lamp, field_of, judged_pixels, pixels_of, refuse_thin, stages_of, wanted
+from caustic_cli.inverse.lamp import design_lamp, final_field, judged_pixels, pixels_of, refuse_thin, stages_of, wanted
 from caustic_cli.inverse.lamp_limits import chip_limits
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
@@ -56,6 +56,8 @@ GHOSTS = "ghosts"
 SHADOWED = 0.002
 #: Part of the brightest pixels of an image that are white.
 WHITE = 0.999
+#: Part of the lit pixels of a picture that edges have in shades while it is one of a single brightness.
+SMOOTH = 0.02
 
 
 class LampEvaluation(NamedTuple):
@@ -118,7 +120,8 @@ class LampDesign:
         rays = rays or effort.final_rays
         pixels = [judged_pixels(self.lamp, self.goal, effort), pixels_of(self.goal, effort.lamp_coarse)]
         fine, coarse = (wanted(self.goal, self.picture, n).numpy() for n in pixels)
-        shaded = len(np.unique(self.picture[self.picture > 0])) > 1
+        lit = self.picture[self.picture > 0]
+        shaded = bool((lit < lit.max()).mean() > SMOOTH)
         intensities = IntensitySum()
         how: dict[str, Any] = {"shaded": shaded, "rays": rays, "seed": seed, "also": intensities.add}
         with one_thread():  # the tensors of a chunk of rays are too small for more
@@ -247,7 +250,7 @@ def _run(project: Project, before: Checkpoint | None, force: bool, say: Reporter
             begun = None if before is None else (before.state.stage, PolarField(before.spaces), before.state.heights)
             how: dict[str, Any] = {"effort": effort, "begun": begun}
             values = design_lamp(lamp, goal, picture, **how, on_iteration=told, on_stage=save)
-        found = LampDesign(project, lamp, goal, field_of(effort), values, picture, {})
+        found = LampDesign(project, lamp, goal, final_field(lamp, effort), values, picture, {})
         evaluation = found.evaluated(None, s.design.seed)
         for words in warnings(lamp, goal, evaluation.figures):
             say.say(words)

@@ -158,7 +158,7 @@ def design_of(
     qualities = [None] if error is None else estimate.cheapest(read, given, error, say, **how)
     for quality in qualities:
         wanted, recording = given if quality is None else {**given, "quality": quality}, recorder(movie, force)
-        prepared = workflow.prepare(read, wanted, **how, out=out, force=force, recorded=recording.recorded, say=say, device=device)
+        prepared = workflow.prepare(read, wanted, **how, out=out, force=force, say=say, device=device)
         done = workflow.design(prepared, device, say, began, recording, error or 0.0)
         if error is None or estimate.reached(done.figures, error, quality, say):
             break

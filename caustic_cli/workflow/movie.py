@@ -44,8 +44,6 @@ class Frame:
 class NoMovie:
     """What a design asks of its recording, where none is made."""
 
-    recorded = False
-
     def begin(self, scene: Scene) -> None:
         """Record images of this scene, by whose screen's pixel areas power is converted to irradiance."""
 
@@ -72,7 +70,6 @@ class Movie(NoMovie):
         InputError: it could not be written, see `io.movie.refuse_unwritable`.
     """
 
-    recorded = True
     #: A .gif or .mp4.
     path: Path
     #: Replace an existing file.

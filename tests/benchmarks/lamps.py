@@ -1,11 +1,13 @@
-"""Lamps: light on the target and its error, on the pixels of the loss of a point, and of a chip on ones half as wide as those.
+"""Lamps: light on the target and its error, on the pixels of a point's loss, of a chip on half as wide ones, and on finer ones.
 
     python tests/benchmarks/lamps.py [--only street,two] [--rays 16e6] [-o FILE.json]
 
 Every lamp is designed by the command's own defaults from acrylic with a radius of 15 mm and judged by rays that the design did not
 use, whose noise is subtracted: with the images A and B of two halves of them and the target T, each over its mean, the mean of
-(A - T) (B - T) is the squared error.  +- is what the noise leaves of it.  Light is a fraction of all that the chip emits, with all
-losses of uncoated surfaces.  Seconds are those of the processor, and of the clock, of the design with its own verdict.
+(A - T) (B - T) is the squared error.  +- is what the noise leaves of it.  "Finer" is the error of the whole target on pixels half
+as wide again, of a point half as wide as those of its loss.  Of a disc those pixels count that lie within it wholly.  Light is a
+fraction of all that the chip emits, with all losses of uncoated surfaces.  Seconds are those of the processor, and of the clock, of
+the design with its own verdict.
 
 The files of a lamp's light (`ldt`) are written, designed for, and written again: the root mean square of the difference of their
 candela, each file scaled to the same light, over that of the first file, each direction weighted with its solid angle.
@@ -25,7 +27,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import caustic_cli
+from caustic_cli.inverse.lamp import wanted
 from caustic_cli.io.photometry import read_photometry
+from caustic_cli.studies.lamp import lamp_figures
 
 
 class Problem(NamedTuple):
@@ -91,7 +95,13 @@ def designed(target: Any, options: dict[str, Any]) -> tuple[Any, float, float]:
 def measured(problem: Problem, rays: float) -> dict[str, Any]:
     """Figures of a problem."""
     lamp, seconds, wall = designed(problem.target, problem.options)
-    return lamp.render(rays, seed=11).figures | {"seconds": seconds, "wall": wall}
+    figures = lamp.render(rays, seed=11).figures
+    finer, coarse = (
+        wanted(lamp.goal, lamp.picture, (k * n // 2, k * m // 2)).numpy() for n, m in [figures["pixels"]] for k in (4, 1)
+    )
+    _, seen = lamp_figures(lamp.lamp, lamp.goal, lamp.field, lamp.values, finer, coarse, rays=int(rays), seed=12)
+    more = {"finer_rms": seen["relative_rms"], "finer_noise": seen["noise"], "seconds": seconds, "wall": wall}
+    return figures | more
 
 
 def difference(wanted: Path, seen: Path) -> float:
@@ -133,14 +143,15 @@ def main() -> None:
         if options.out:
             options.out.write_text(json.dumps(found, indent=1))
     print(f"on {os.cpu_count()} cores")
-    print("| lamp | light | asked | error | without a border | asked | least wall, mm | pixels | seconds | of the clock |")
-    print("| --- " * 10 + "|")
+    print("| lamp | light | asked | error | without a border | finer | asked | least wall, mm | pixels | seconds | of the clock |")
+    print("| --- " * 11 + "|")
     for name, problem in PROBLEMS.items():
         if name in found:
             f = found[name]
             print(
                 f"| {WORDS[name]} | {f['of_source']:.4f} | {problem.light:g} | {f['relative_rms']:.4f} ± {f['noise']:.4f}"
-                f" | {f['interior_rms']:.4f} ± {f['interior_noise']:.4f} | {problem.error:g} | {f['least_wall']:.2f}"
+                f" | {f['interior_rms']:.4f} ± {f['interior_noise']:.4f}"
+                f" | {f['finer_rms']:.4f} ± {f['finer_noise']:.4f} | {problem.error:g} | {f['least_wall']:.2f}"
                 f" | {' x '.join(map(str, f['pixels']))} | {f['seconds']:.0f} | {f['wall']:.0f} |"
             )
     for name in PASSAGES:

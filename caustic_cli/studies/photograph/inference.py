@@ -11,8 +11,9 @@ Notation
 
 A, p and q are those of the largest evidence (MacKay, Bayesian interpolation, Neural Computation 4, 1992), with all other unknowns
 integrated over.  The response of the camera is fitted alone before every level; jointly with the rest it follows too slowly.
-Levels go from coarse pixels and few modes to fine pixels and all modes.  The camera is known from its marks up to a covariance,
-which is its prior.
+Levels go from coarse pixels and few modes to fine pixels and as many modes as the prior asks for.  The finest leave out pixels of
+which a part is saturated: the mean of what was cut off is not the mean of the light.  The camera is known from its marks up to a
+covariance, which is its prior.
 """
 
 from __future__ import annotations
@@ -24,12 +25,25 @@ from itertools import product
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
-from scipy.ndimage import gaussian_filter
 
-from caustic_cli.studies.photograph.model import Grid, Guess, PartModel, Prediction, Response, View, Window, cosines, heights_at
+from caustic_cli.studies.photograph.model import (
+    Grid,
+    Guess,
+    Landing,
+    PartModel,
+    Prediction,
+    Response,
+    View,
+    Window,
+    cosines,
+    heights_at,
+)
 
 #: Pixels along the longer side, modes along each axis, blur in pixels and most steps of the levels; modes are capped by the last.
-LEVELS = ((32, 6, 1.0, 4), (64, 12, 1.0, 4), (128, 20, 0.7, 8))
+LEVELS = ((32, 6, 1.0, 4), (64, 12, 1.0, 4), (128, 20, 0.7, 8), (128, 32, 0.7, 6))
+#: Part of the variance of the deviation's curvature beyond the modes of a level from which on the next one takes more for the same
+#: pixels.
+LEFT = 0.01
 #: Part of the screen around the light of the lens that is compared, half widths; light below which the screen counts as dark, over
 #: the mean.
 MARGIN, DARK = 0.12, 0.02
@@ -43,7 +57,9 @@ OFF = 0.02
 #: Number of unknowns of each photograph: response, c and t.
 OWN = 14
 #: Sobolev priors that are compared: A in mm, p, q.
-AMPLITUDES, POWERS, CORNERS = 10.0 ** np.arange(-6.0, -0.99, 0.25), (2.0, 3.0, 4.0, 6.0), (1.0, 2.0, 4.0, 8.0)
+AMPLITUDES, POWERS, CORNERS = 10.0 ** np.arange(-6.0, -0.99, 0.5), (2.0, 3.0, 4.0, 6.0), (1.0, 2.0, 4.0, 8.0, 16.0)
+#: Modes along each axis beyond which only priors next to the present one are compared.
+FINE = 24
 #: Prior standard deviation of tilt, mm.
 TILT = 0.02
 #: Points along each axis at which the deviation is summed up.
@@ -52,7 +68,7 @@ SAMPLES = 33
 FIRST = (3e-3, 3.0, 2.0)
 #: Least standard deviation of a code: of 8 bits.
 ROUNDING = 1.0 / 255.0 / np.sqrt(12.0)
-#: Most pixels over which misses count as correlated: those of a model that does not fit yet are correlated widely.
+#: Most pixels over which misses count as correlated in a fit: those of a model that does not fit yet are correlated widely.
 FEW = 9.0
 #: Blocks along the longer side over whose pixels misses are summed for the covariance, of 8 pixels each on the last grid.
 BLOCKS = 16
@@ -86,11 +102,11 @@ class Sobolev:
 @dataclass(frozen=True, eq=False)
 class Observation:
     """A photograph of the part: the model of its light and screen; its codes on n x m pixels of a window of the screen, averaged as
-    light by this gamma and B-splines, NaN where they are not known; and the covariance (9, 9) of the amplitudes c that its marks
-    leave, half widths of the screen."""
+    light by this gamma and B-splines, NaN where they are not known, or, without the last argument, not even about; and the
+    covariance (9, 9) of the amplitudes c that its marks leave, half widths of the screen."""
 
     model: PartModel
-    photograph: Callable[[tuple[int, int], Window, float], np.ndarray]
+    photograph: Callable[[tuple[int, int], Window, float, bool], np.ndarray]
     covariance: np.ndarray
 
     def precision(self, side: int) -> np.ndarray:
@@ -211,24 +227,40 @@ def infer(
     prior, done, whole = Sobolev(), 0, sum(level[3] for level in levels)
     fit: _Fit | None = None
     windows = [lit(one.model) for one in observations]
-    for side, modes, smooth, steps in levels:
+    for k, (side, modes, smooth, steps) in enumerate(levels):
+        if k > 0 and side == levels[k - 1][0] and not asked(prior, levels[k - 1][1], modes):
+            done += steps
+            continue
         fit = _Fit(
             [
-                _Seen(one, side, smooth, window, view.response)
+                _Seen(one, side, smooth, window, view.response, side == levels[-1][0])
                 for one, window, view in zip(observations, windows, guess.views, strict=True)
             ],
             side > levels[0][0],
         )
         guess = fit.with_response(fit.traced(guess).with_modes(modes))
-        for k in range(steps):
+        for step in range(steps):
             guess, prior, ends = fit.step(guess, prior)
             done += 1
             show(done, whole)
-            if ends and k > 0:
-                done += steps - k - 1
+            if ends and step > 0:
+                done += steps - step - 1
                 break
     assert fit is not None
     return fit.result(guess, prior)
+
+
+def near(every: Sequence[float], at: float, only: bool) -> list[float]:
+    """All of some values, or only the closest one to `at` and its neighbours."""
+    k = int(np.argmin([abs(np.log(value / at)) for value in every])) if only else 0
+    return list(every[max(0, k - 1) : k + 2] if only else every)
+
+
+def asked(prior: Sobolev, count: int, more: int) -> bool:
+    """Whether a prior expects more than LEFT of the variance of curvature, by which light is concentrated, beyond `count` modes."""
+    k2 = np.add.outer(np.arange(more) ** 2, np.arange(more) ** 2)
+    variance = np.square(prior.deviations(more) * k2)
+    return bool(1.0 - variance[:count, :count].sum() / variance.sum() > LEFT)
 
 
 def throws_before(models: Sequence[PartModel]) -> np.ndarray:
@@ -251,25 +283,31 @@ def lit(model: PartModel) -> Window:
 
 
 class _Seen:
-    """A photograph on one grid."""
+    """A photograph on one grid; exact: with more rays, and without pixels that are known about only, which coarse fits need to find
+    their way."""
 
-    def __init__(self, observation: Observation, side: int, smooth: float, window: Window, response: Response):
-        self.model, self.camera = observation.model, observation.precision(side)
+    def __init__(self, observation: Observation, side: int, smooth: float, window: Window, response: Response, exact: bool = True):
+        self.model, self.camera, self.exact = observation.model, observation.precision(side), exact
         (rx, ry), (wide, high) = self.model.scene.screen.half_size, (b - a for a, b in window)
         aspect = high * ry / (wide * rx)
         shape = (side, max(8, round(side * aspect))) if aspect <= 1 else (max(8, round(side / aspect)), side)
-        seen = observation.photograph(shape, window, float(np.exp(response.log_gamma)))
-        self.grid, self.known = Grid(shape, smooth, window, self.model), np.isfinite(seen)
-        self.seen = gaussian_filter(np.where(self.known, seen, np.nanmean(seen)), smooth, mode="nearest", truncate=3.5)
+        seen = observation.photograph(shape, window, float(np.exp(response.log_gamma)), exact)
+        self.known = np.isfinite(seen)
+        self.grid = Grid(shape, smooth, window, self.model, self.known)
+        self.seen = self.grid.compared(np.nan_to_num(seen))
         #: Pixels over which misses are correlated, and the standard deviation of a pixel times the root of that.
         self.correlated, self.sigma = 1.0, 0.05
+
+    def light(self, guess: Guess, number: int) -> Landing | None:
+        """Rays of a prediction, None for those of its derivatives."""
+        return self.model.light(guess, guess.views[number].throw) if self.exact else None
 
     def misses(self, prediction: Prediction) -> np.ndarray:
         """r, 0 where it is not known."""
         return np.where(self.known, self.seen - prediction.codes, 0.0)
 
-    def estimate(self, prediction: Prediction) -> None:
-        """sigma from the misses of a prediction."""
+    def estimate(self, prediction: Prediction, most: float = FEW) -> None:
+        """sigma from the misses of a prediction, which count as correlated over so many pixels at most."""
         misses = self.misses(prediction)
         spectrum = np.abs(np.fft.rfft2(misses, [2 * n for n in misses.shape])) ** 2
         along = np.fft.irfft2(spectrum)[: misses.shape[0] // 2, : misses.shape[1] // 2]
@@ -278,7 +316,7 @@ class _Seen:
         lengths = [
             1.0 + 2.0 * line[1 : 1 + int(np.argmax(np.append(line[1:], 0.0) < 0.1))].sum() for line in (along[:, 0], along[0])
         ]
-        self.correlated = float(np.clip(lengths[0] * lengths[1], 1.0, FEW))
+        self.correlated = float(np.clip(lengths[0] * lengths[1], 1.0, most))
         size = float(np.sqrt((misses**2).sum() / max(self.known.sum(), 1)))
         self.sigma = max(size, ROUNDING) * np.sqrt(self.correlated)
 
@@ -303,7 +341,7 @@ class _Fit:
 
     def predictions(self, guess: Guess) -> list[Prediction]:
         """Of all photographs."""
-        return [Prediction.of(one.model, one.grid, guess, k) for k, one in enumerate(self.seen)]
+        return [Prediction.of(one.model, one.grid, guess, k, one.light(guess, k)) for k, one in enumerate(self.seen)]
 
     def _at(self, number: int, modes: int) -> np.ndarray:
         """Indices of the unknowns on which a photograph depends, in the order of its derivatives."""
@@ -335,10 +373,10 @@ class _Fit:
 
     def with_response(self, guess: Guess, steps: int = 8) -> Guess:
         """The guess with the responses fitted alone."""
-        landings = [one.model.landing(guess, view.throw) for one, view in zip(self.seen, guess.views, strict=True)]
+        light = [one.light(guess, k) for k, one in enumerate(self.seen)]
 
         def predicted(guess: Guess) -> list[Prediction]:
-            return [Prediction.of(one.model, one.grid, guess, k, landings[k]) for k, one in enumerate(self.seen)]
+            return [Prediction.of(one.model, one.grid, guess, k, light[k]) for k, one in enumerate(self.seen)]
 
         predictions = predicted(guess)
         for _ in range(steps):
@@ -404,8 +442,11 @@ class _Fit:
         return better[0].guess, prior, before - self._cost(better, prior) < ENOUGH * before
 
     def _derivatives(self, number: int, prediction: Prediction) -> np.ndarray:
-        """Derivatives of the codes of a photograph by its unknowns and the shared ones, (unknowns, n, m), 0 where not known."""
-        return np.concatenate([prediction.by_response(), *prediction.by_shape()]) * self.seen[number].known
+        """Derivatives of the codes of a photograph by its unknowns and the shared ones, (unknowns, n, m) float32, 0 where not
+        known."""
+        found = np.concatenate([prediction.by_response(), *prediction.by_shape()])
+        found *= self.seen[number].known
+        return found
 
     def _normal(self, predictions: Sequence[Prediction]) -> tuple[np.ndarray, np.ndarray]:
         """J^T J / sigma^2 by all unknowns, with modes in mm, and J^T (r + J x) / sigma^2 with x their values, those of responses
@@ -413,7 +454,7 @@ class _Fit:
         count = predictions[0].guess.modes.size
         normal, pull = np.zeros((self.shared + 1 + count,) * 2), np.zeros(self.shared + 1 + count)
         for k, (one, prediction) in enumerate(zip(self.seen, predictions, strict=True)):
-            J = self._derivatives(k, prediction)[:, one.known]  # (unknowns, N)
+            J = self._derivatives(k, prediction)[:, one.known].astype(float)  # (unknowns, N)
             guess, view = prediction.guess, prediction.view
             x = np.concatenate([np.zeros(4), view.camera, [view.throw, guess.scale], guess.modes.ravel()])
             at = self._at(k, count)
@@ -450,9 +491,14 @@ class _Fit:
         return solution[:first] - now, solution[first:].reshape(guess.modes.shape) - guess.modes
 
     def _best_prior(self, guess: Guess, normal: np.ndarray, pull: np.ndarray, now: Sobolev) -> Sobolev:
-        """The prior of the largest evidence: over A, p and q near the present ones, and all of them coarsely."""
+        """The prior of the largest evidence, of all that are compared; of many modes, of those next to the present one."""
         best, most = now, -np.inf
-        for amplitude, power, corner in product(AMPLITUDES[::2], POWERS, CORNERS):
+        for amplitude, power, corner in product(
+            *(
+                near(every, at, len(guess.modes) > FINE)
+                for every, at in zip((AMPLITUDES, POWERS, CORNERS), (now.amplitude, now.power, now.corner), strict=True)
+            )
+        ):
             tried = Sobolev(float(amplitude), power, corner)
             try:
                 evidence = self._solve(guess, normal, pull, tried)[1]
@@ -474,7 +520,8 @@ class _Fit:
         middle[:first, :first] = self._before(guess)[0]
         for k, (one, prediction) in enumerate(zip(self.seen, predictions, strict=True)):
             at = self._at(k, guess.modes.size)
-            J = (self._derivatives(k, prediction) / one.sigma * unit[at, None, None]).astype(np.float32)
+            J = self._derivatives(k, prediction)
+            J *= (unit[at, None, None] / one.sigma).astype(np.float32)
             r, C = one.misses(prediction) / one.sigma, covariance[np.ix_(at, at)].astype(np.float32)
             (n, m), scores = one.grid.shape, []
             side = -(-max(n, m) // BLOCKS)
@@ -490,7 +537,7 @@ class _Fit:
         """The inference at a guess."""
         predictions = self.predictions(self.traced(guess))
         for one, prediction in zip(self.seen, predictions, strict=True):
-            one.estimate(prediction)
+            one.estimate(prediction, np.inf)
         normal, pull = self._normal(predictions)
         _, _, (factor, unit) = self._solve(guess, normal, pull, prior)
         covariance = cho_solve(factor, np.eye(len(unit)))

@@ -13,8 +13,9 @@ Notation
 
 Rays lie on a regular lattice and are traced by the tracer of the project.  To first order a ray's landing point depends on the
 surface through height and slope where it leaves: three traces, of a surface raised and tilted a little, give the derivatives with
-respect to every mode.  The image is a sum of quadratic B-splines (3 x 3 pixels) of the landing points, blurred by a Gaussian, and
-that of an extended source its convolution with the image of that source by the middle of the lens.
+respect to every mode.  The image, on the finest pixels of more rays than its derivatives, is a sum of quadratic B-splines (3 x 3
+pixels) of the landing points, blurred by a Gaussian, and that of an extended source its convolution with the image of that source
+by the middle of the lens.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 import torch
@@ -45,6 +47,8 @@ from caustic_cli.studies.photograph.camera import displacements
 RAISED, TILTED = 1e-4, 1e-6
 #: Displacement of the screen for the same, mm.
 FARTHER = 0.1
+#: Rays of a prediction over those of its derivatives.
+MORE = 4
 #: Width by which the rectangle of the modes is larger than the aperture at each of its edges, over the aperture: the slopes of
 #: cosines vanish at the edges of their rectangle, those of a part at its own do not.
 BEYOND = 0.15
@@ -184,7 +188,10 @@ class PartModel:
         scene = replace(scene, source=scene.source.pointlike())
         self.scene, self.field, self.heights = scene, field, heights.detach().double().cpu()
         self._beyond = np.zeros((2, 1))
-        self._tracers = list(tracers(scene, field, rays_of(scene, "grid", rays), torch.float64, 1 << 24))
+        self._bases: list[tuple[np.ndarray, np.ndarray]] | None = None
+        self._tracers, self._more = (
+            list(tracers(scene, field, rays_of(scene, "grid", count), torch.float64, 1 << 24)) for count in (rays, MORE * rays)
+        )
 
     def made(self, guess: Guess) -> Tensor:
         """Control heights of the part."""
@@ -204,18 +211,32 @@ class PartModel:
 
     def _moved(self, guess: Guess) -> np.ndarray:
         """Displacements on the screen by deviation and scale to first order, (2, N) half widths."""
-        (u, v), (rx, ry), k = self.places, self.field.half_size, len(guess.modes)
-        cu, su, cv, sv = cosines(u, k), slopes_of_cosines(u, k), cosines(v, k), slopes_of_cosines(v, k)
-        along = cv @ guess.modes.T  # (N, k)
-        local = [(cu * along).sum(1), (su * along).sum(1) / (2 * rx), (cu * (sv @ guess.modes.T)).sum(1) / (2 * ry)]
+        (cu, su), (cv, sv) = self.bases(len(guess.modes))
+        modes = guess.modes.T.astype(cv.dtype)
+        along = cv @ modes  # (N, k)
+        local = [(cu * along).sum(1), (su * along).sum(1), (cu * (sv @ modes)).sum(1)]
         return np.einsum("sin,sn->in", self.responses, np.array(local)) + guess.scale * self.by_scale
 
-    def land(self, heights: Tensor, throw: float = 0.0) -> Landing:
-        """The rays of a surface on the screen, which is `throw` farther away, mm."""
+    def light(self, guess: Guess, throw: float = 0.0) -> Landing:
+        """MORE times as many rays of a part, traced themselves: few, on their lattice, leave stripes in light that is spread."""
+        return self.land(self.made(guess), throw, self._more)
+
+    def bases(self, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """`count` modes and their slopes per mm at the rays, along each axis, (N, count) float32 each: half of the time, and
+        is exact to 1e-7 of a step."""
+        if self._bases is None or self._bases[0][0].shape[1] != count:
+            self._bases = [
+                (cosines(c, count).astype(np.float32), (slopes_of_cosines(c, count) / (2 * r)).astype(np.float32))
+                for c, r in zip(self.places, self.field.half_size, strict=True)
+            ]
+        return self._bases
+
+    def land(self, heights: Tensor, throw: float = 0.0, through: list | None = None) -> Landing:
+        """The rays of a surface on the screen, which is `throw` farther away, mm; through: other tracers than its own."""
         screen, found = self.scene.screen, []
         screen = replace(screen, z=screen.z + throw * math.copysign(1.0, screen.z)) if throw else screen
         with torch.no_grad():
-            for traced in self._tracers:
+            for traced in self._tracers if through is None else through:
                 ray = traced.land({EXIT: heights}, screen)[0]
                 shape = torch.broadcast_shapes(*(torch.as_tensor(c).shape for c in (*ray.origin[:2], ray.power)))
                 found.append([torch.as_tensor(c).expand(shape).reshape(-1) for c in (*ray.origin[:2], ray.power)])
@@ -282,12 +303,28 @@ class PartModel:
         return np.nan_to_num(np.array([more.x - less.x, more.y - less.y]) / (2 * step))
 
 
+def _gaussian(image: np.ndarray, blur: float) -> np.ndarray:
+    """Images (..., n, m) blurred by this many pixels."""
+    return gaussian_filter(image, (0.0,) * (image.ndim - 2) + (blur, blur), truncate=CUT, mode="nearest") if blur > 0 else image
+
+
 class Grid:
     """The pixels on which a photograph is compared, n x m over a window of the screen; `smooth`: by how many both are blurred;
-    model: for its image of the source."""
+    model: for its image of the source; known: pixels (n, m) of which the photograph tells the light, all unless given."""
 
-    def __init__(self, shape: tuple[int, int], smooth: float, window: Window = WHOLE, model: PartModel | None = None):
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        smooth: float,
+        window: Window = WHOLE,
+        model: PartModel | None = None,
+        known: np.ndarray | None = None,
+    ):
         self.shape, self.smooth, self.window = shape, smooth, window
+        self.known = np.ones(shape, dtype=bool) if known is None else known
+        #: Pixels along a half width of the screen, and on the whole screen.
+        self.finer = [n / (high - low) for n, (low, high) in zip(shape, window, strict=True)]
+        self.pixels = 4.0 * self.finer[0] * self.finer[1]
         self.kernel: np.ndarray | None = None
         if model is not None and max(model.spread.reach()) > 0:
             half = model.scene.screen.half_size
@@ -304,12 +341,11 @@ class Grid:
         """Sharp images (..., n, m) as the source and the camera blur them."""
         if self.kernel is not None:
             image = fftconvolve(image, self.kernel[(None,) * (image.ndim - 2)], mode="same", axes=(-2, -1))
-        return self.smoothed(image, self.sensor_blur(response))
+        return _gaussian(image, self.sensor_blur(response))
 
-    def smoothed(self, image: np.ndarray, blur: float | None = None) -> np.ndarray:
-        """Images (..., n, m) blurred by this many pixels, `smooth` unless given."""
-        blur = self.smooth if blur is None else blur
-        return gaussian_filter(image, (0.0,) * (image.ndim - 2) + (blur, blur), truncate=CUT, mode="nearest") if blur > 0 else image
+    def compared(self, image: np.ndarray) -> np.ndarray:
+        """Images (..., n, m) of the grid as they are compared: smoothed, without what is not known."""
+        return _gaussian(image * self.known, self.smooth)
 
     def sensor_blur(self, response: Response) -> float:
         """The blur of the camera, pixels."""
@@ -329,12 +365,11 @@ class Grid:
         at = [(c - d + 1.0) * 0.5 * n - 0.5 for c, d, n in zip((x, y), moved, image.shape, strict=True)]
         return map_coordinates(image, at, order=1).reshape(self.wide)
 
-    def splats(self, landing: Landing, camera: np.ndarray) -> tuple[csc_matrix, csc_matrix, csc_matrix]:
-        """Matrices (pixels of the wide grid, N) from powers to E, and from power times displacement along X and Y to its change."""
+    def _weights(self, landing: Landing, camera: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
+        """Weights of rays in three pixels along each axis and their slopes, (3, N) each, and the nine pixels, (9, N)."""
         moved = np.einsum("k,kin->in", camera, displacements(landing.x, landing.y))
-        scale = [n / (high - low) for n, (low, high) in zip(self.shape, self.window, strict=True)]
         seen = landing.x + moved[0], landing.y + moved[1]
-        at = [(c - low) * k - 0.5 + self.around for c, k, (low, _) in zip(seen, scale, self.window, strict=True)]
+        at = [(c - low) * k - 0.5 + self.around for c, k, (low, _) in zip(seen, self.finer, self.window, strict=True)]
         middle, inside = [], np.isfinite(at[0] + at[1])
         for c, n in zip(at, self.wide, strict=True):
             c[~inside] = 1.0
@@ -347,16 +382,27 @@ class Grid:
             weights.append(np.array([0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2]) * inside)
             slopes.append(np.array([t - 0.5, -2.0 * t, t + 0.5]) * inside)
             index.append(np.clip(nearest, 1, n - 2).astype(np.int32) + np.array([-1, 0, 1], dtype=np.int32)[:, None])
-        rows = (index[0][:, None] * self.wide[1] + index[1][None]).reshape(9, -1).T.ravel()
-        pointers = np.arange(0, 9 * len(landing.x) + 1, 9, dtype=np.int32)
-        pixels = 4.0 * scale[0] * scale[1]  # of the whole screen
+        return weights, slopes, (index[0][:, None] * self.wide[1] + index[1][None]).reshape(9, -1)
+
+    def counted(self, landing: Landing, camera: np.ndarray) -> np.ndarray:
+        """E on the wide grid."""
+        (x, y), _, pixels = self._weights(landing, camera)
+        light = np.zeros(self.wide[0] * self.wide[1])
+        for k, (i, j) in enumerate(product(range(3), range(3))):
+            light += np.bincount(pixels[k], x[i] * y[j] * landing.power, len(light))
+        return self.pixels * light.reshape(self.wide)
+
+    def splats(self, landing: Landing, camera: np.ndarray) -> tuple[csc_matrix, csc_matrix]:
+        """Matrices (pixels of the wide grid, N), float32, from power times displacement along X and Y to the change of E."""
+        weights, slopes, pixels = self._weights(landing, camera)
+        rows, pointers = pixels.T.ravel(), np.arange(0, 9 * len(landing.x) + 1, 9, dtype=np.int32)
 
         def matrix(along_x: np.ndarray, along_y: np.ndarray, factor: float) -> csc_matrix:
-            values = (along_x[:, None] * along_y[None]).reshape(9, -1).T.ravel() * (factor * pixels)
+            values = (along_x[:, None] * along_y[None]).reshape(9, -1).T.ravel() * (factor * self.pixels)
+            values = values.astype(np.float32)
             return csc_matrix((values, rows, pointers), shape=(self.wide[0] * self.wide[1], len(landing.x)))
 
-        by_x, by_y = matrix(slopes[0], weights[1], scale[0]), matrix(weights[0], slopes[1], scale[1])
-        return matrix(weights[0], weights[1], 1.0), by_x, by_y
+        return matrix(slopes[0], weights[1], self.finer[0]), matrix(weights[0], slopes[1], self.finer[1])
 
 
 @dataclass(eq=False)
@@ -368,24 +414,23 @@ class Prediction:
     guess: Guess
     view: View
     landing: Landing
-    splats: tuple[csc_matrix, csc_matrix, csc_matrix]
     #: E on the wide grid, sharp and blurred.
     sharp: np.ndarray
     blurred: np.ndarray
 
     @classmethod
-    def of(cls, model: PartModel, grid: Grid, guess: Guess, number: int = 0, landing: Landing | None = None) -> Prediction:
-        """The prediction of one of the photographs, by its number; landing: of the same surface, if it is known already."""
+    def of(cls, model: PartModel, grid: Grid, guess: Guess, number: int = 0, light: Landing | None = None) -> Prediction:
+        """The prediction of one of the photographs, by its number; light: rays of the same surface for it other than those of the
+        derivatives."""
         view = guess.views[number]
-        landing = model.landing(guess, view.throw) if landing is None else landing
-        splats = grid.splats(landing, view.camera)
-        sharp = (splats[0] @ landing.power).reshape(grid.wide) + grid.sampled(model.diffraction, view.camera)
-        return cls(model, grid, guess, view, landing, splats, sharp, grid.blurred(sharp, view.response))
+        landing = model.landing(guess, view.throw)
+        sharp = grid.counted(landing if light is None else light, view.camera) + grid.sampled(model.diffraction, view.camera)
+        return cls(model, grid, guess, view, landing, sharp, grid.blurred(sharp, view.response))
 
     @property
     def codes(self) -> np.ndarray:
-        """On the grid, smoothed."""
-        return self.grid.inner(self.grid.smoothed(self.view.response.codes(self.blurred)))
+        """On the grid, as they are compared."""
+        return self.grid.compared(self.grid.inner(self.view.response.codes(self.blurred)))
 
     def by_response(self) -> np.ndarray:
         """Derivatives of the codes by the four values of the response, (4, n, m)."""
@@ -395,29 +440,26 @@ class Prediction:
         wider = grid.blurred(self.sharp, replace(r, log_blur=r.log_blur + step))
         gain = np.exp(r.log_gain)
         stack = [by_light * gain * self.blurred, by_light, by_gamma, by_light * gain * (wider - self.blurred) / step]
-        return grid.inner(grid.smoothed(np.array(stack)))
+        return grid.compared(grid.inner(np.array(stack))).astype(np.float32)
 
     def _of_images(self, images: np.ndarray) -> np.ndarray:
         """Derivatives of the codes (N, n, m) from those of the sharp E, (pixels, N)."""
         r, grid = self.view.response, self.grid
         images = grid.blurred(np.ascontiguousarray(images.T).reshape(-1, *grid.wide), r)
-        images *= r.slopes(self.blurred)[0] * np.exp(r.log_gain)
-        return grid.inner(grid.smoothed(images))
+        images *= (r.slopes(self.blurred)[0] * np.exp(r.log_gain)).astype(images.dtype)
+        return grid.compared(grid.inner(images))
 
     def by_shape(self) -> Iterator[np.ndarray]:
         """Derivatives of the codes by c, (9, n, m); by t and s, (2, n, m); by the modes (k, .), (l, n, m) for each k."""
-        power, (_, by_x, by_y) = self.landing.power, self.splats
-        fields = displacements(self.landing.x, self.landing.y) * power  # (9, 2, N)
+        power, (by_x, by_y) = self.landing.power, self.grid.splats(self.landing, self.view.camera)
+        fields = (displacements(self.landing.x, self.landing.y) * power).astype(np.float32)  # (9, 2, N)
         yield self._of_images(by_x @ fields[:, 0].T + by_y @ fields[:, 1].T)
         model, guess = self.model, self.guess
-        dx, dy = np.array([model.by_throw, model.by_scale]).swapaxes(0, 1) * power  # (2, N) each
+        dx, dy = (np.array([model.by_throw, model.by_scale]).swapaxes(0, 1) * power).astype(np.float32)  # (2, N) each
         yield self._of_images(by_x @ dx.T + by_y @ dy.T)
-        u, v = model.places
-        (up, along_x, along_y), (rx, ry), count = model.responses, model.field.half_size, len(guess.modes)
-        cu, cv = (cosines(c, count) for c in (u, v))
-        su, sv = slopes_of_cosines(u, count) / (2 * rx), slopes_of_cosines(v, count) / (2 * ry)
-        parts = [power * c for c in (*up, *along_x, *along_y)]  # up x, up y, slope x: x, y, slope y: x, y
-        for k in range(count):
+        (up, along_x, along_y), ((cu, su), (cv, sv)) = model.responses, model.bases(len(guess.modes))
+        parts = [(power * c).astype(np.float32) for c in (*up, *along_x, *along_y)]  # up x, up y, slope x: x, y, slope y: x, y
+        for k in range(len(guess.modes)):
             a, b = cu[:, k], su[:, k]
             of_value = [a * parts[0] + b * parts[2], a * parts[1] + b * parts[3]]
             of_slope = [a * parts[4], a * parts[5]]

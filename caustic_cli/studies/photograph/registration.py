@@ -23,6 +23,8 @@ LEAST = 64
 BLACK, CONTRAST = 0.06, 0.04
 #: Codes from which on a pixel is saturated, and largest fraction of the screen, and of the image's light, where it may be.
 SATURATED, BLOWN = 0.98, 0.25
+#: Saturated part of what is averaged, and part that is not, from which on the average is not known.
+PARTLY = 0.01
 #: Pixels along a side of the images that are compared, blurred by so many pixels; the least correlation of a photograph and the
 #: image of its lens, and by how much another orientation may be better.
 COARSE, SMOOTH, LEAST_LIKE, BETTER = 48, 2.0, 0.45, 0.03
@@ -61,9 +63,14 @@ class Photograph:
         quadratic B-spline about it; NaN beyond the photograph."""
         return np.clip(rectified(self.codes**gamma, self.camera, shape, window, splined=splined), 0.0, 1.0) ** (1.0 / gamma)
 
-    def for_model(self, shape: tuple[int, int], window: Window, gamma: float) -> np.ndarray:
-        """The same averaged as the rays of the model are: another average would be taken for a part of another relief."""
-        return self.on_screen(shape, window, gamma, splined=True)
+    def for_model(self, shape: tuple[int, int], window: Window, gamma: float, exact: bool = True) -> np.ndarray:
+        """The same averaged as the rays of the model are: another average would be taken for a part of another relief; exact: NaN
+        also where a part of what is averaged is saturated, so that its mean is not known."""
+        seen = self.on_screen(shape, window, gamma, splined=True)
+        if not exact:
+            return seen
+        full = rectified((self.codes >= SATURATED).astype(float), self.camera, shape, window, splined=True)
+        return np.where((full > PARTLY) & (full < 1.0 - PARTLY), np.nan, seen)
 
 
 def read_codes(path: Path) -> np.ndarray:

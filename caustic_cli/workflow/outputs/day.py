@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import date
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -75,7 +76,7 @@ class DayOfSunlight(Output):
             found, frames = study.follow_day(
                 follower,
                 shines,
-                lambda seen: _frame(follower, lens.encoding, seen),
+                partial(_frame, follower, lens.encoding),
                 lambda what, done, whole: show("day", what, done, whole),
             )
         write_movie(film, frames, [FRAME] * len(frames))

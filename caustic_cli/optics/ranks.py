@@ -1,16 +1,19 @@
-"""Data-parallel design by several processes (`torchrun`): each rank traces its share of the rays; images and gradients are summed.
+"""Several processes (`torchrun`), on one machine or more, that share the work of a command.
 
-Rank 0 reads, decides, writes and reports.  The others receive the design from it and run the same loop with the same numbers; only
-the rays they trace differ.  Decisions that depend on a clock or a signal are broadcast by rank 0.  In a single process every
-function here does nothing.
+Rank 0 reads, decides, writes and reports; the others `serve` it.  In a design each rank traces its share of the rays, and images
+and gradients are summed: all run the same loop with the same numbers, and decisions that depend on a clock or a signal are
+broadcast by rank 0.  Independent items, such as the draws of a tolerance analysis, are dealt out (`mapped`).  In a single process
+every function here does nothing.
 """
 
 from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -18,6 +21,9 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.schema import checks
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @contextmanager
@@ -89,17 +95,48 @@ def rank_and_size() -> tuple[int, int]:
     return 0, 1
 
 
-def send(task) -> None:
-    """Rank 0: send a task to the others (`receive`), None to release them."""
+def send(task: Callable[[], Any] | None) -> None:
+    """Rank 0: let the others call a task, a picklable function (`serve`); None releases them."""
     if rank_and_size()[1] > 1:
         _call(dist.broadcast_object_list, [task], 0)
 
 
-def receive():
-    """The other ranks: receive a task from rank 0."""
-    task = [None]
-    _call(dist.broadcast_object_list, task, 0)
-    return task[0]
+def serve() -> None:
+    """The other ranks: call the tasks of rank 0 until it releases this one."""
+    task: list[Any] = [None]
+    while True:
+        _call(dist.broadcast_object_list, task, 0)
+        if task[0] is None:
+            return
+        task[0]()
+
+
+def mapped(function: Callable[[T], R], items: Iterable[T], progress: Callable[[int], None] = lambda done: None) -> list[R]:
+    """`function` of every item, in their order; on rank 0, where the others `serve`, each rank takes its share.
+
+    The same for any number of ranks if the result of an item depends on that item alone.
+
+    Args:
+        function, items: to be pickled; progress: called with the number of items done, about.
+    """
+    items = list(items)
+    send(partial(_share, function, items))
+    return _share(function, items, progress)
+
+
+def _share(function: Callable[[T], R], items: list[T], progress: Callable[[int], None] = lambda done: None) -> list[R]:
+    """All results, of which this rank computes every n-th."""
+    rank, size = rank_and_size()
+    found: list[Any] = [None] * len(items)
+    for k in range(rank, len(items), size):
+        found[k] = function(items[k])
+        progress(min(len(items), k - rank + size))
+    if size > 1:
+        parts: list[Any] = [None] * size
+        _call(dist.all_gather_object, parts, found[rank::size])
+        for r, part in enumerate(parts):
+            found[r::size] = part
+    return found
 
 
 def all_reduce(*tensors: Tensor) -> None:
