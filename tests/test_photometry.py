@@ -12,7 +12,7 @@ from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lamp import directions_of, pixels_of
 from caustic_cli.io.photometry import Photometry, read_photometry, write_ies, write_ldt
-from caustic_cli.project.photometric_target import PIXELS, angles_of, divided, edges_of, picture_of, refined
+from caustic_cli.project.photometric_target import PIXELS, angles_of, as_means, divided, edges_of, picture_of, refined
 from caustic_cli.scene.lamp import Goal
 
 PLANES, ANGLES = 15.0 * np.arange(24), 5.0 * np.arange(37)
@@ -238,6 +238,11 @@ def test_sharp_edges_run_within_the_cells_of_a_file():
     plane, gamma = np.degrees(np.arctan2(d[:, 1], d[:, 0])), np.degrees(np.arccos(d[:, 2]))
     wanted = rectangle(plane, gamma).reshape(found.shape)
     assert np.abs(found - wanted).sum() < 0.015 * wanted.sum()
+    cone = counted(lambda plane, gamma: 1.0 * (gamma < 30.3) + 0.0 * plane)
+    finely = as_means(cone)
+    assert np.ptp(finely.values, axis=0).max() < 1e-9  # the same in all planes
+    at = float(np.interp(-0.5, -finely.values[0], finely.angles))
+    assert at == pytest.approx(30.3, abs=0.1)
     smooth = counted(lambda plane, gamma: np.exp(-((gamma / 40.0) ** 4)) * (2.0 + np.cos(np.radians(plane))))
     finely = refined(smooth)
     assert np.array_equal(divided(finely, smooth.values).values, finely.values)

@@ -200,10 +200,10 @@ class RoofLimits:
         return STIFF / count * total
 
 
-Limits = SurfaceLimits | RoofLimits
+LampLimits = SurfaceLimits | RoofLimits
 
 
-def limits_of(lamp: Lamp, goal: Goal, field: PolarField, brightest: float) -> Limits | None:
+def limits_of(lamp: Lamp, goal: Goal, field: PolarField, brightest: float) -> LampLimits | None:
     """The limits of a design, brightest: as of `Folds`; None of a hemisphere, whose light is the same around any scaled lens."""
     if lamp.surfaces == 2:
         return SurfaceLimits(lamp, goal, field, brightest)
@@ -298,7 +298,7 @@ class Aimed:
     """Mean square distance of the directions (N, 3) behind a lens of light that is emitted in given ones from those aimed at: the
     transport takes light within the lens as if from the centre, from which that behind a plane does not come."""
 
-    def __init__(self, lamp: Lamp, field: PolarField, limits: Limits, emitted: Tensor, power: Tensor, aims: Tensor):
+    def __init__(self, lamp: Lamp, field: PolarField, limits: LampLimits, emitted: Tensor, power: Tensor, aims: Tensor):
         x, y, z = emitted.unbind(1)
         zero = torch.zeros_like(x)
         self.lamp, self.field, self.aims, self.limits = lamp, field, aims, limits

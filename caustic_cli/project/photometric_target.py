@@ -26,6 +26,8 @@ EDGE = 0.4
 #: Cells along either axis among which the bright and the dark side of an edge are; part of the step between them that the
 #: differences beside a cell add up to if the edge is sharp; and part of it within which a cell beside an edge is even.
 AROUND, PLATEAU, EVEN = 5, 0.75, 0.03
+#: Difference of equal light, over the greatest.
+EQUAL = 1e-9
 
 
 def angles_of(light: Photometry, projection: str = "latitude") -> tuple[float, float]:
@@ -109,12 +111,17 @@ def divided(finely: Photometry, values: np.ndarray) -> Photometry:
 
 
 def brightest(light: np.ndarray, area: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """How much of each small area of cells, (.., k), belongs to a `part` (..) of the area of the whole cell, the brightest one."""
+    """How much of each small area of cells, (.., k), belongs to a `part` (..) of the area of the whole cell, the brightest one;
+    areas of equal light have equal parts."""
     order = np.argsort(-light, axis=-1, kind="stable")
-    own = np.take_along_axis(area, order, -1)
-    left = (part * own.sum(-1))[..., None] - (np.cumsum(own, -1) - own)
-    found = np.empty_like(light)
-    np.put_along_axis(found, order, (left / own.clip(1e-300)).clip(0.0, 1.0), -1)
+    own, values = (np.take_along_axis(c, order, -1) for c in (area, light))
+    until = np.cumsum(own, -1)
+    darker = values[..., :-1] - values[..., 1:] > EQUAL * light.max(initial=0.0)
+    begins, ends = (np.insert(darker, at, True, -1) for at in (0, darker.shape[-1]))
+    before = np.maximum.accumulate(np.where(begins, until - own, 0.0), -1)
+    after = np.minimum.accumulate(np.where(ends, until, np.inf)[..., ::-1], -1)[..., ::-1]
+    found, lit = np.empty_like(light), (part * until[..., -1])[..., None] - before
+    np.put_along_axis(found, order, (lit / (after - before).clip(1e-300)).clip(0.0, 1.0), -1)
     return found
 
 

@@ -21,6 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 from quality import DATA, EXAMPLES, caustic, pictures
 
 from caustic_cli import load
+from caustic_cli.inverse.lamp import pixels_of, wanted
 from caustic_cli.optics.lamp import sides
 from caustic_cli.workflow.lamp import LampDesign
 
@@ -94,15 +95,25 @@ def shaded(z: np.ndarray) -> Image.Image:
     return Image.fromarray((shown * 255).astype(np.uint8))
 
 
+def codes_of(light: np.ndarray) -> np.ndarray:
+    """Light (rows, columns[, colours]) as bytes to be shown."""
+    brightest = np.percentile(light if light.ndim == 2 else light.max(-1), 99.9)
+    return (np.clip(light / brightest, 0.0, 1.0) ** (1 / 2.2) * 255).astype(np.uint8)
+
+
 def strip(project: Path, path: Path) -> None:
     """The lens' panels side by side."""
     if (project / "hours.png").exists():  # the pictures of all hours, whose mean is the target
         panels = [Image.open(project / name) for name in ("target.png", "hours.png")]
+    elif isinstance(lens := load(project), LampDesign):
+        pixels = pixels_of(lens.goal, SIDE * SIDE)
+        wanted_there = wanted(lens.goal, lens.picture, pixels).numpy() / lens.goal.shares(pixels)
+        seen = np.asarray(Image.open(project / "render.png").convert("L"), float)  # as linear as the target
+        panels = [Image.fromarray(codes_of(light)) for light in (wanted_there.T[::-1], seen)]
     else:
-        lens = load(project)
-        target = lens.picture if isinstance(lens, LampDesign) else lens.target
+        target = lens.target
         light = np.moveaxis(np.atleast_3d(target if target.ndim == 2 else np.moveaxis(target, 0, -1)), (0, 1), (1, 0))[::-1]
-        codes = (np.clip(light / np.percentile(light.max(-1), 99.9), 0.0, 1.0) ** (1 / 2.2) * 255).astype(np.uint8)
+        codes = codes_of(light)
         names = [name for name in ("render.png", "wave.png") if (project / name).exists()]
         panels = [Image.fromarray(codes[..., 0] if codes.shape[-1] == 1 else codes), *(Image.open(project / n) for n in names)]
     panels = [p.convert("RGB").resize((SIDE, round(SIDE * p.height / p.width)), Image.Resampling.LANCZOS) for p in panels]
