@@ -147,7 +147,7 @@ def test_two_surfaces_are_designed_rendered_and_exported(capfd):
     figures = figures_of(capfd, "design", "uniform", *ROAD[:-1], "--lamp-surfaces", "2", "--chip", "0.5", "-o", "two")
     assert figures["of_source"] > 0.8 and figures["least_wall"] > 1.0
     found = LampDesign.of(Project.open("two"))
-    assert found.values.shape == (2, 19, 19) and found.lamp.inner == 2.0
+    assert found.values.shape == (2, 11, 11) and found.lamp.inner == 2.0
     seen = figures_of(capfd, "render", "two", "--rays", "20000", "-o", "two.png")
     assert seen["of_source"] == pytest.approx(figures["of_source"], abs=0.02)
     vertices, faces = lamp_mesh(found.lamp, found.field, found.values, (40, 90))
