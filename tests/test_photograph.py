@@ -389,14 +389,13 @@ def test_a_file_that_names_a_photograph_badly_is_refused(lens, here, capfd, text
 
 @pytest.mark.parametrize("exposure", [0.8, 1.6])
 def test_a_folded_caustic_is_inferred_within_what_is_said(lens, here, monkeypatch, exposure):
-    """Light of a pixel comes from several places of the part, and its lines are saturated, which came out as another gamma and a
-    surface many standard deviations off."""
+    """Light of a pixel comes from several places of the part, and its lines are saturated: with these the gamma was 2.42."""
     monkeypatch.setattr(inference, "LEVELS", ((32, 6, 1.0, 4), (64, 12, 1.0, 4), (96, 16, 0.7, 8)))
     monkeypatch.setattr(photographs, "RAYS", 160)
     error = form_error(5.0, 3e-3, 2.0, 11)
     found = judged(lens, photograph(lens, error, SHARP, 11, exposure=exposure))
     response = found.found.guess.views[0].response
-    assert np.exp(response.log_gamma) == pytest.approx(2.4, rel=0.02) and response.background == pytest.approx(0.01, abs=0.002)
+    assert np.exp(response.log_gamma) == pytest.approx(2.4, rel=0.005) and response.background == pytest.approx(0.01, abs=3e-4)
     off = surfaces(found.found)[1] - error
     assert off.std() < 2.0 * found.found.uncertainty()
     heights = correction.corrected_heights(lens.project, lens, found, "cpu")
