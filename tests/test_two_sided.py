@@ -376,10 +376,11 @@ def test_two_pictures_by_the_command_line(_here, capfd, monkeypatch):
     assert again["second_relative_rms"] != seen["second_relative_rms"] and again["relative_rms"] == seen["relative_rms"]
 
 
-def test_a_disc_s_light_is_collimated(_here, capfd, monkeypatch):
+@pytest.mark.parametrize("sun", [(), ("--source-angle", "0.533")])
+def test_a_disc_s_light_is_collimated(_here, capfd, monkeypatch, sun):
     """Of an extended source: no limit is stated by the blur of a surface that is not designed yet."""
     monkeypatch.setattr(workflow, "_run", begun)
-    run(capfd, "design", "one.png", *SMALL, "--source", "disc", "--collimate", "-o", "p")
+    run(capfd, "design", "one.png", *SMALL, "--source", "disc", *sun, "--collimate", "-o", "p")
     assert source_spread(Project.open("p").scene()) is None
 
 

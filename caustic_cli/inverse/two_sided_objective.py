@@ -22,7 +22,7 @@ from caustic_cli.optics.trace import Parameters, Tracer
 from caustic_cli.scene import Scene
 
 #: Angle, rad, equivalent to a relative RMS error of 1.
-SHARP = 2e-2
+SHARP = 1e-2
 
 
 class TwoSidedObjective(Objective):

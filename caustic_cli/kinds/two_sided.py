@@ -33,6 +33,8 @@ from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures
 
 THICK, SAG = 2.0, 0.45  # thickness over width of the lens, and largest height of a side over thickness
+#: Factor of the iterations for two pictures, which the initial surfaces pair to first order in the angles only.
+LONGER = 2.5
 #: Divisor of the rays for the initial surfaces.
 STARTS = 4
 
@@ -73,7 +75,9 @@ class TwoSides(SeveralSurfaces):
         cls.complete_control(d)
         d.fill_design(preconditioner="laplacian")
         if not d.complete_given_stages():
-            d.set_stages(refinement(d.lens.control, d.rays, d.resolution, d.effort.sides))
+            longer = 1.0 if d.s.chosen("second.file") is None else LONGER
+            stages = refinement(d.lens.control, d.rays, d.resolution, d.effort.sides)
+            d.set_stages([stage | {"iterations": round(longer * stage["iterations"])} for stage in stages])
         elif any(stage.get(key) for stage in d.design.stages for key in ("waves", "spread")):
             raise InputError(
                 "[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread"

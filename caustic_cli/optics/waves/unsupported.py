@@ -32,7 +32,8 @@ WAVE_REFINEMENT = Capability(
         "ray file": "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
         "curved screen": "⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine",
         "several sources": "⟨design.waves⟩ on needs one source: light of several is refined by rays alone",
-        "two sides": "⟨design.waves⟩ on: two free-form sides are refined by rays alone",
+        "two sides": "⟨design.waves⟩ on: two free-form sides are refined by rays alone, since those of a picture's creases cross"
+        " inside the glass, so that the light behind it has no single wavefront",
     },
 )
 WAVES_BY_DEFAULT = Capability(
