@@ -22,6 +22,7 @@ from dataclasses import replace
 from functools import singledispatch
 
 import numpy as np
+import torch
 from scipy.interpolate import RegularGridInterpolator
 
 from caustic_cli.errors import InputError
@@ -29,6 +30,7 @@ from caustic_cli.inverse.relay import trace_through, without_apertures, without_
 from caustic_cli.inverse.transport import cell_means
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance, slopes_inside
+from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
 from caustic_cli.scene import Aperture, CircularAperture, Scene
@@ -49,30 +51,37 @@ TRACED_STEPS, FOUND = 12, 1e-7
 
 
 def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
-    """Power per area projected along z in the cells with corners x (n + 1,), y (m + 1,): (n, m); and unit directions inside the
-    glass at the corners, three (n + 1, m + 1) arrays, or None for light along z.  z: heights of the surface there, mm.
+    """Power per area projected along z in the cells with corners x (n + 1,), y (m + 1,): (n, m); and directions inside the glass
+    at the corners, three (n + 1, m + 1) arrays of the length of the index there over that of the lens, or None for light along z.
+    z: heights of the surface there, mm.
 
     The unit is that of intensity over its axial value times solid angle for a source nearby, and arbitrary for others.
 
     Raises:
         InputError: the source lies behind the entrance.
     """
-    light, directions = (_traced if scene.in_front else _direct)(scene, x, y, z)
+    light, directions = (_traced if is_traced(scene) else _direct)(scene, x, y, z)
     return light * _part_within(scene.lens.opening, x, y), directions
+
+
+def is_traced(scene: Scene) -> bool:
+    """Whether the light at the exit follows from its heights by rays: behind other lenses, or in a medium that bends them."""
+    return bool(scene.in_front) or medium_of(scene.lens).varies
 
 
 def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, tuple | None]:
     """The same in air on the plane of the entrance."""
-    air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", entrance=None), second_target=None)
+    bare = {"index": 1.0 + 1e-9, "glass": None, "gradient": None, "fresnel": "none", "entrance": None}
+    air = replace(scene, lens=replace(scene.lens, **bare), second_target=None)
     return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
 
 
 def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
-    """`incident` over the whole rectangle, traced through the lenses before the lens."""
+    """`incident` over the whole rectangle, traced through the lenses before the lens and in its medium."""
     pupil, lens, whole = scene.pupil, scene.lens, System.of(without_freeforms(scene))
     names = [e.name for e in whole.elements]
     system = without_apertures(whole, 0, names.index(ENTRANCE) + 1)
-    first = scene.in_front[0].extent[0]
+    first, medium = scene.lowest, medium_of(lens)
 
     def arrive(at: np.ndarray, z: np.ndarray):
         """Intersections with the heights z of rays from points (2, N) of the pupil, their directions in the glass, their points on
@@ -80,9 +89,11 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
         d = _from_source(scene, *at)
         back = (pupil.z - first) / d[2] + 1e-6  # the first surface may reach through the pupil
         state = trace_through(system, (at[0] - back * d[0], at[1] - back * d[1], pupil.z - back * d[2]), d)
-        inside = np.stack([c.numpy().reshape(z.shape) for c in state.full(state.direction)])
-        entered = np.stack([c.numpy().reshape(z.shape) for c in state.origin[:2]])
-        return entered + (z - lens.z_in) / inside[2] * inside[:2], inside, entered, state.power.numpy().reshape(z.shape)
+        entered, direction = (tuple(c.double() for c in state.full(v)) for v in (state.origin, state.direction))
+        depth = torch.from_numpy(z.ravel() - lens.z_in)
+        point, direction = medium.onto_plane((*entered[:2], torch.zeros_like(depth)), direction, depth)
+        there, inside, entered = (np.stack([c.numpy().reshape(z.shape) for c in v]) for v in (point[:2], direction, entered[:2]))
+        return there, inside, entered, state.power.numpy().reshape(z.shape)
 
     small, middle = 1e-3 * min(pupil.half_size), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     start = arrive(small * middle, np.full(3, float(z.mean())))[0]
@@ -114,9 +125,10 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
         inside = np.all([far / r <= 1 + 1e-9 for far, r in aperture.distances(*where)], axis=0)
         power = np.where(known & inside, power, 0.0)
     power = power * _pupil_irradiance(scene, *at)
-    return cell_means(power), _extrapolated(
-        d, known & (power > 0), goal.reshape(2, *shape) / np.array(lens.half_size)[:, None, None]
-    )
+    goal = goal.reshape(2, *shape)
+    d = _extrapolated(d, known & (power > 0), goal / np.array(lens.half_size)[:, None, None])
+    n = medium.relative_index((*(torch.from_numpy(c.ravel()) for c in goal), torch.from_numpy(flat - lens.z_in)))
+    return cell_means(power), tuple((n if isinstance(n, float) else n.numpy().reshape(shape)) * c for c in d)
 
 
 def _extrapolated(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

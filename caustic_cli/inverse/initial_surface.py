@@ -21,7 +21,7 @@ from torch import Tensor
 
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.incidence import incident, lit_rectangle
+from caustic_cli.inverse.incidence import incident, is_traced, lit_rectangle
 from caustic_cli.inverse.projection import CrossedProjection, ScreenProjection, projection_of, seen_by_light
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scattered import Pixels
@@ -133,7 +133,7 @@ class _Grid:
     def solved(self, light: np.ndarray, directions, mean: float, potential: np.ndarray | None = None, **options) -> MappedSurface:
         """The surface of this mean height that maps the light to the picture; potential: initial one at these corners, mm^2."""
         scene = self.scene
-        if not light.all() and (scene.in_front or not scene.source.collimated):
+        if not light.all() and (is_traced(scene) or not scene.source.collimated):
             options["darkest"] = DARKEST
         projection = self.projection(mean)
         target, half, centre = (
@@ -292,7 +292,7 @@ def first_surface(
         z = surface(*grid.places)
     if scene.source.distant or lens.mirror or scene.elements:
         found = None
-        for _ in range(1 if scene.source.distant and not scene.in_front else PASSES):
+        for _ in range(1 if scene.source.distant and not is_traced(scene) else PASSES):
             known = None if found is None else found.transport.potential
             found = grid.solved(*grid.incident(z), float(z.mean()), known, **options)
             z = found.heights

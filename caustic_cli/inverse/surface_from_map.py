@@ -41,6 +41,8 @@ from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
 
 Projection = ScreenProjection | RelayedScreen | CrossedProjection  # of a screen that is not the plane z_screen
+#: Largest difference of the length of a direction from 1, and one that is none.
+LONGEST, UNIT = 0.5, 1e-6
 #: Cells over which e is smoothed, each with its share where there is light: wide averages count where there is none nearby.
 SMOOTHING = {2.0: 1.0, 8.0: 1e-3, 32.0: 1e-6}
 DISTINCT = 1e-9  # least usual stretch over the greatest, where most light goes to one point
@@ -106,7 +108,8 @@ def surface(
         target: the picture, (k, l), any unit; half sizes in mm as for `transport.solve`.
         index: of the glass, with 1 outside; its inverse for a surface by which light enters the glass; -1 for a mirror.
         z_screen, thickness: the screen's plane and the surface's mean height, mm.
-        directions: unit directions inside the glass at those corners, three (n + 1, m + 1) arrays, or None for (0, 0, 1).
+        directions: inside the glass at those corners, of the length of the index there over `index`, three (n + 1, m + 1) arrays,
+            or None for (0, 0, 1).
         corrections: most outer iterations.
         centre: of the picture on the plane, mm.
         projection: of a screen that does not lie in that plane; target, centre and landing points are then projected.
@@ -215,10 +218,14 @@ def _directions(directions, shape) -> tuple:
     d = tuple(np.asarray(v, dtype=np.float64) for v in directions)
     if len(d) != 3 or any(v.shape != tuple(shape) for v in d):
         raise InputError(f"directions must be three arrays of shape {tuple(shape)}, a corner of a source cell each")
-    unit = all(np.isfinite(v).all() for v in d) and (np.abs(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - 1) < 1e-6).all()
-    if not unit or (d[2] <= 0).any():
-        raise InputError("directions must be finite unit vectors with a positive z component")
+    if not (np.abs(_length(d) - 1.0) < LONGEST).all() or (d[2] <= 0).any():  # NaN is not
+        raise InputError("directions must be finite vectors of a length near 1 with a positive z component")
     return d
+
+
+def _length(d: tuple) -> np.ndarray:
+    """Lengths of vectors."""
+    return np.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
 
 
 def heights(
@@ -330,19 +337,21 @@ def land(
 def refract_to_screen(
     x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "none", projection: Projection | None = None
 ) -> tuple[np.ndarray, ...]:
-    """Landing points u, v of rays d inside the glass that leave it at (x, y, z) with slopes zx, zy, NaN where totally reflected,
-    and their transmittance.  projection: as of `surface`; NaN where they miss its screen."""
+    """Landing points u, v of rays d (see `surface`) that leave the glass at (x, y, z) with slopes zx, zy, NaN where totally
+    reflected, and their transmittance.  projection: as of `surface`; NaN where they miss its screen."""
     shape, backend = z.shape, Torch()  # too few rays to be worth compiling
 
     def flat(value):
         return value if isinstance(value, float) else torch.from_numpy(np.broadcast_to(value, shape).flatten())
 
-    origin, slopes = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy))
+    origin, slopes, eta, long = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy)), abs(index), _length(d)
+    if (np.abs(long - 1.0) > UNIT).any():  # the index varies
+        d, eta = tuple(c / long for c in d), flat(eta * long)
     out = backend.interact(
         tuple(map(flat, d)),
         slopes,
         torch.ones(z.size, dtype=torch.float64),
-        eta=abs(index),
+        eta=eta,
         reflects=index < 0,
         fresnel=fresnel,
     )

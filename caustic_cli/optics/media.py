@@ -67,6 +67,15 @@ class Medium:
         """Transfer the rays of an `Interaction` through it to the surface, of these heights: along straight lines."""
         meet(tracer, m, heights)
 
+    def relative_index(self, point: tuple) -> Tensor | float:
+        """Refractive index at points (N,) in the frame of the element in front, over `index`."""
+        return 1.0
+
+    def onto_plane(self, point: tuple, direction: tuple, z: Tensor) -> tuple[tuple, tuple]:
+        """Points and unit directions of rays (N,) within it where they reach z (N,), mm, in the frame of the element in front."""
+        x, y, dz = *point[:2], z - point[2]
+        return (x + dz / direction[2] * direction[0], y + dz / direction[2] * direction[1], point[2] + dz), direction
+
     def receive(self, tracer, m, parameters) -> None:
         """Set the refractive index behind the surface of an `Interaction` where it depends on the point of intersection."""
 

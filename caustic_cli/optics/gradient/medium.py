@@ -13,11 +13,13 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.frames import rotate_to_global, to_global, to_local
 from caustic_cli.optics.gradient.fields import IndexField, index_field_of
 from caustic_cli.optics.gradient.transfer import NextSurface, RayFlow, transfer
 from caustic_cli.optics.media import Medium
 from caustic_cli.optics.rays import Hit, RayState
+from caustic_cli.optics.surfaces.plane import Plane
 from caustic_cli.optics.system import Element
 from caustic_cli.scene import Lens
 
@@ -84,6 +86,20 @@ class GradientMedium(Medium):
         state.origin = to_global(element.pose, local, state.datum)
         state.path = state.path + scale * found.path
         m.state = state
+
+    @property
+    def _flow(self) -> RayFlow:
+        """Rays on the CPU, with its own coefficients."""
+        return RayFlow(backend_for("cpu").flow, self.gradient, None)
+
+    def relative_index(self, point: tuple) -> Tensor:
+        return self._flow.index_at(point) / self.index
+
+    def onto_plane(self, point: tuple, direction: tuple, z: Tensor) -> tuple[tuple, tuple]:
+        """Along curves."""
+        plane = NextSurface(Plane(), None, lambda points, vectors: ((points[0], points[1], points[2] - z), vectors), 1.0)
+        found = transfer(self._flow, point, direction, plane)
+        return found.point, found.direction
 
     def receive(self, tracer, m, parameters) -> None:
         """That of the field at the points of intersection; behind a mirror light stays in the medium in front."""
