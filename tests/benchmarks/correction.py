@@ -4,7 +4,7 @@
     python tests/benchmarks/correction.py ball.caustic
     python tests/benchmarks/correction.py ball.caustic --only 4 --rounds 2
     caustic design examples/ball.png --mag 3 --resolution 64 --waves off --control 67 -o small.caustic
-    python tests/benchmarks/correction.py small.caustic --random 40 --first 7000
+    python tests/benchmarks/correction.py small.caustic --random 100 --first 7000
 
 Photographs and errors of the corrected parts are by the independent tracer of tests/independent/photographs.py; a photograph is an
 8-bit JPEG of 900 x 800 pixels through a projective camera with distortion, blur, noise and gamma.
