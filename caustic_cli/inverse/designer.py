@@ -238,6 +238,7 @@ class Designer:
                 if state.optimizer:
                     method.load(state.optimizer)
                 self._apart(on_objective, state)
+                continue  # which may end it
             told = method.rejected > 0
             moved = method.step()
             if method.rejected and not told:
