@@ -29,6 +29,7 @@ from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Proj
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import cell_lines, cell_means, corners
 from caustic_cli.optics.interface import slopes_inside
+from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Aperture, Component, Lens, Scene
@@ -280,7 +281,8 @@ def first_surface(
     """
     began = time.monotonic()
     scene, target = seen_by_light(scene, target)
-    times, options = _refinement(cells, target) if scene.source.distant else 1, {}
+    finer_cells = scene.source.distant and not medium_of(scene.lens).varies  # rays to so many corners would take minutes
+    times, options = _refinement(cells, target) if finer_cells else 1, {}
     cells = min(cells, SOLVED * times)
     if times > 1:
         options = {"tolerance": EXACT, "most": STEPS}

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/kinds.py [--resolution 96] [--only NAME,...]      some ten minutes on two cores; prints a Markdown table
 
-Designs by `caustic design examples/flame.png --quality draft` (a lamp by its preset), one after the other with one thread.  Times
+Designs by `caustic design examples/flame.png --quality draft`, one after the other, on one thread; lamps have `lamps.py`.  Times
 are of the whole command, less those of one that does nothing; errors are those that the design itself states, by independent light,
 with their standard error.  Before the first row a design compiles the kernels.
 """
@@ -42,7 +42,6 @@ KINDS = {
         *("--source", "gaussian", "--waist", "3", "--wavelengths", "1064", "--lens-size", "12", "--throw", "500", "--margin", "0"),
         *("--picture-size", "13x13", "--loss", "log-rms", "--efficiency", "0.97"),
     ),
-    "lamp": ("--preset", "street"),
 }
 
 
@@ -67,7 +66,7 @@ def main() -> None:
         project = f"{folder}/lens"
 
         def design(*options: str) -> tuple[float, int, dict]:
-            size = () if "--preset" in options else ("--resolution", asked.resolution, "--quality", "draft")
+            size = ("--resolution", asked.resolution, "--quality", "draft")
             return run(("design", str(FLAME), *options, *size, "--force", "-o", project))
 
         design(*KINDS["lens by rays"])
