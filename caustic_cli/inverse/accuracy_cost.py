@@ -72,6 +72,7 @@ class CostOfAccuracy:
         self.rows = list(earlier)
         before = self.rows[-1] if self.rows else Row(0, 0.0, 0.0, 0.0)
         self._offset = before.seconds, before.processor_seconds  # less what the measurements took
+        self._begun = start.seconds, start.processor_seconds
         self._spent = 0.0
 
     def measure(self, iteration: int, lens: Any, always: bool = False) -> list[Row]:
@@ -80,7 +81,8 @@ class CostOfAccuracy:
         if (always or not late) and (not self.rows or self.rows[-1].iteration < iteration):
             wall, processor = (a + b for a, b in zip(self._offset, (self.start.seconds, self.start.processor_seconds), strict=True))
             if (error := self.error_of(lens)) is not None:
-                self.rows.append(Row(iteration, wall, processor, error))
+                # the initial lens is measured when its objective is ready, which its iterations take the time of
+                self.rows.append(Row(iteration, *(self._begun if iteration == 0 else (wall, processor)), error))
             self._spent += self._offset[0] + self.start.seconds - wall
             self._offset = wall - self.start.seconds, processor - self.start.processor_seconds
         return self.rows
