@@ -17,6 +17,7 @@ from caustic_cli.export.lamp import lamp_mesh
 from caustic_cli.inverse import lamp as inverse
 from caustic_cli.io.photometry import Photometry, read_photometry, write_ies, write_ldt
 from caustic_cli.io.picture import read_picture
+from caustic_cli.optics.lamp import uncoated_limit
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.project.project import Project
 from caustic_cli.scene.lamp import Goal, Lamp
@@ -462,8 +463,8 @@ def test_a_report_is_drawn_by_design_and_render(road, capfd, monkeypatch):
 def test_a_sphere_about_a_point_has_the_intensity_of_its_lambertian_chip():
     field = PolarField.uniform((8, 8))
     table = intensity_table(Lamp(), field, field.sphere(12.0), (5.0, 30.0), rays=200_000)
-    assert table.flux == pytest.approx(1000.0 * Lamp().uncoated_limit, rel=1e-9)
-    expected = Lamp().uncoated_limit * 1000.0 / math.pi * np.cos(np.radians(table.angles[:17]))
+    assert table.flux == pytest.approx(1000.0 * uncoated_limit(Lamp()), rel=1e-9)
+    expected = uncoated_limit(Lamp()) * 1000.0 / math.pi * np.cos(np.radians(table.angles[:17]))
     np.testing.assert_allclose(table.values[:, :17], np.broadcast_to(expected, (12, 17)), rtol=0.03, atol=1.0)
     assert table.values[:, 20:].max() == 0.0
     assert table.full_angle(0.5, 0) == pytest.approx(120.0, abs=2.0)

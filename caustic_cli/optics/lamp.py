@@ -45,6 +45,8 @@ from caustic_cli.scene.sources.rayset import RaySet
 LOSSES = ("inner_fresnel", "missed", "total_internal_reflection", "outer_fresnel")
 #: Least component along z of light that is followed to a plane: flatter light lands beyond 50 distances from the axis.
 SHALLOW = 0.02
+#: Rays by which the light that uncoated surfaces pass is summed.
+LIMIT_RAYS = 100_000
 #: Rays traced at a time.
 CHUNK = 1 << 17
 #: The constant a of a `PointGrid`, and its points over those of them within the circle.
@@ -250,7 +252,7 @@ def _along(like: Tensor) -> Vectors:
 
 def _from_point(lamp: Lamp, hit: PolarHit, power: Tensor) -> LampLight:
     """Light of the origin, which meets the hemisphere at normal incidence and the surface along the frame's axis."""
-    kept = math.sqrt(lamp.uncoated_limit)  # of one surface
+    kept = lamp.normal_transmittance
     return _leave(
         lamp, hit, _along(power), kept * power, {"inner_fresnel": (1.0 - kept) * power, "missed": torch.zeros_like(power)}
     )
@@ -277,6 +279,16 @@ def entered(lamp: Lamp, hit: PolarHit, local: Vectors, power: Tensor) -> tuple[V
     arriving = torch.where(met, power, torch.zeros_like(power))
     reflected = arriving * reflectance("exact", c, s, 1.0 / lamp.index)
     return from_frame(frame(hit.u, hit.v), out), arriving - reflected, {"inner_fresnel": reflected, "missed": power - arriving}
+
+
+def uncoated_limit(lamp: Lamp) -> float:
+    """Largest fraction of the light of the chip's centre that can leave without coatings: what passes the inner side, a hemisphere
+    for a free-form one, and the outer one at normal incidence."""
+    field = PolarField.uniform((4, 4))
+    side, passed = inner_side(lamp, field, None), 0.0
+    for grid in PointGrid.of(field, LIMIT_RAYS, lamp.chip):
+        passed += float(entered(lamp, side.from_origin(grid.u, grid.v), _along(grid.power), grid.power)[1].sum())
+    return lamp.normal_transmittance * passed
 
 
 def from_centre(lamp: Lamp, field: PolarField, directions: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,8 +22,6 @@ SHAPES = ("point", "disc", "rectangle", "rays")
 CLASS = 5.0
 #: Points of a pixel along both axes at which its solid angle is taken, and pixels of that of a whole target.
 WITHIN, WHOLE = 3, (300, 300)
-#: Angles from the axis over which light is summed.
-STEPS = 10_000
 #: Border of a target, a fraction of its smaller side, that is no part of its interior: least, and most where a chip blurs more.
 BORDERS = (0.025, 0.1)
 #: Most lamps of an array.
@@ -297,17 +295,6 @@ class Lamp:
         return min(max(least, 2.0 * self.blur(goal)), most)
 
     @property
-    def uncoated_limit(self) -> float:
-        """Largest fraction of the light that can leave without coatings: (1 - R)^2, R = ((n - 1) / (n + 1))^2, of normal incidence;
-        through a flat inner side what passes that of the light of the chip's centre."""
-        normal = 1.0 - ((self.index - 1.0) / (self.index + 1.0)) ** 2
-        return normal * (normal if self.flat is None else self._entering(self.flat))
-
-    def _entering(self, height: float) -> float:
-        """Part of the light of the chip's centre that passes a plane at this height, within the cavity, by Fresnel's equations."""
-        angle, n = 0.5 * math.pi * (np.arange(STEPS) + 0.5) / STEPS, self.index
-        outside, inside = np.cos(angle), np.sqrt(1.0 - (np.sin(angle) / n) ** 2)
-        light = np.sin(angle) * (outside if self.chip.intensity is None else self.chip.intensity.relative(angle))
-        meets = height * np.tan(angle) <= self.inner
-        across, along = (outside - n * inside) / (outside + n * inside), (n * outside - inside) / (n * outside + inside)
-        return float((light * meets * (1.0 - 0.5 * (across**2 + along**2))).sum() / light.sum())
+    def normal_transmittance(self) -> float:
+        """1 - R at normal incidence, R = ((n - 1) / (n + 1))^2."""
+        return 1.0 - ((self.index - 1.0) / (self.index + 1.0)) ** 2

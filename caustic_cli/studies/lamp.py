@@ -18,7 +18,7 @@ from torch import Tensor
 
 from caustic_cli.effort import STANDARD
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.lamp import LOSSES, LampLight, emissions, land, least_wall, sides, through
+from caustic_cli.optics.lamp import LOSSES, LampLight, emissions, land, least_wall, sides, through, uncoated_limit
 from caustic_cli.optics.lamp_array import among
 from caustic_cli.optics.lamp_ghosts import ghosts
 from caustic_cli.optics.reconstruction import Filter
@@ -183,7 +183,7 @@ def lamp_figures(
         "uniformity": uniformity,
         "border": lamp.border(goal),
         "border_unit": goal.unit,
-        "uncoated_limit": lamp.uncoated_limit,
+        "uncoated_limit": uncoated_limit(lamp),
         "lost": found.lost,
         **({"cut_off": cut_off(found.rise)} if goal.by_latitude else {}),
         "least_wall": least_wall(lamp, field, values),

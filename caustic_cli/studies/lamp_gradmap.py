@@ -29,7 +29,7 @@ STEP = 1e-8
 
 
 @dataclass(frozen=True)
-class LampImage:
+class LampRendering:
     """The image of a lamp as a function of control values.
 
     Args:

@@ -94,7 +94,7 @@ class OfLens:
 class OfLamp:
     """Of the radius of a lamp's outer surface, as `OfLens`; on the pixels of its last stage."""
 
-    traced: lamp_gradmap.LampImage
+    traced: lamp_gradmap.LampRendering
 
     @classmethod
     def of(cls, path: Path, rays: int, seed: int | None, kind: str, size: Size, alpha: float | None) -> OfLamp:
@@ -104,7 +104,7 @@ class OfLamp:
         count = stages_of(one.lamp, current_effort())[-1][1][0]
         screen = Screen(one.goal.size, resolution=pixels_of(one.goal, count))
         filter, seed = filter_from(kind, size, screen, alpha), project.seed if seed is None else seed
-        return cls(lamp_gradmap.LampImage(one.lamp, one.goal, one.field, one.values, screen, filter, rays, seed))
+        return cls(lamp_gradmap.LampRendering(one.lamp, one.goal, one.field, one.values, screen, filter, rays, seed))
 
     @property
     def shape(self) -> Size:

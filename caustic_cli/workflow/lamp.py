@@ -30,6 +30,7 @@ from caustic_cli.inverse.lamp_limits import chip_limits
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
 from caustic_cli.loading import OnDemand
+from caustic_cli.optics.lamp import uncoated_limit
 from caustic_cli.optics.lamp_array import clear_pitch
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.project import checkpoint, directory, uptodate
@@ -268,7 +269,7 @@ def _run(project: Project, before: Checkpoint | None, force: bool, say: Reporter
 def notes(lamp: Lamp, goal: Goal) -> Iterator[str]:
     """What limits a lamp, before its design: its uncoated surfaces, and the deflection of one."""
     how = "by normal incidence" if lamp.flat is None else "through a flat inner side"
-    yield f"uncoated surfaces pass at most {lamp.uncoated_limit:.1%} of the light, {how}"
+    yield f"uncoated surfaces pass at most {uncoated_limit(lamp):.1%} of the light, {how}"
     if lamp.count > 1 and not goal.far:
         width, height = lamp.places.max(0) - lamp.places.min(0)
         yield f"the pictures of the lamps lie within {width:g} x {height:g} mm of each other"

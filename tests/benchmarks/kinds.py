@@ -45,15 +45,15 @@ KINDS = {
 }
 
 
-def run(arguments: tuple[str, ...]) -> tuple[float, int, dict]:
-    """Processor seconds of a command and its largest memory, bytes, with one thread, and its JSON."""
+def run(arguments: tuple[str, ...]) -> tuple[float, dict]:
+    """Processor seconds of a command with one thread, and its JSON."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [sys.executable, "-m", "caustic_cli", *arguments, "--threads", "1", "--json", "--quiet"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)}: {done.stderr}")
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, after.ru_maxrss, json.loads(done.stdout)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, json.loads(done.stdout)
 
 
 def main() -> None:
@@ -65,18 +65,18 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         project = f"{folder}/lens"
 
-        def design(*options: str) -> tuple[float, int, dict]:
+        def design(*options: str) -> tuple[float, dict]:
             size = ("--resolution", asked.resolution, "--quality", "draft")
             return run(("design", str(FLAME), *options, *size, "--force", "-o", project))
 
         design(*KINDS["lens by rays"])
-        idle, _, _ = run(
+        idle, _ = run(
             ("design", str(FLAME), *KINDS["lens by rays"], "--resolution", asked.resolution, "--quality", "draft", "-o", project)
         )
         print("| kind | error | by | iterations | processor s | over the plain lens |\n| --- | --- | --- | --- | --- | --- |")
         plain = 0.0
         for name in dict.fromkeys(("lens by rays", *asked.only.split(","))):
-            seconds, _, figures = design(*KINDS[name])
+            seconds, figures = design(*KINDS[name])
             plain = plain or seconds - idle
             noise = f" ± {figures['noise']:.4f}" if figures.get("noise") and figures["error_by"] == "rays" else ""
             cost = f"{seconds - idle:.1f} | {(seconds - idle) / plain:.1f}"
