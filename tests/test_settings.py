@@ -13,7 +13,7 @@ from caustic_cli.config import settings
 from caustic_cli.config.default_stages import GAPS, transport_cells
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, Settings, build_lens, build_scene, dump, parse, tables_of
-from caustic_cli.effort import FINE, STANDARD, TEST, current_effort
+from caustic_cli.effort import FINE, SINGLE_SPANS, STANDARD, TEST, current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.project.completion import complete
 from caustic_cli.schema.table import Parameters
@@ -315,15 +315,30 @@ def test_a_picture_with_gaps_has_a_net_as_fine_as_its_creases_ask_for():
     own = {**rays, "lens": {"control": [203, 203]}}
     assert complete(own, 1.0, gaps=1.0).design.stages == complete(own, 1.0).design.stages
     blurred = {**rays, "source": {"type": "disc", "position": [[0.0, 0.0, -1000.0]]}}
-    tilted = {**rays, "screen": {"tilt": [0.0, 30.0]}}  # whose pixels are not those of the map
-    for other in ({}, blurred, tilted):  # the first is seen as a wave
+    for other in ({}, blurred):  # the first is seen as a wave
         assert complete(other, 1.0, gaps=1.0).lens.control == complete(other, 1.0).lens.control
+
+
+@pytest.mark.parametrize(
+    ("scene", "spans"),
+    [
+        ({"source": {"type": "point", "position": [[0.0, 0.0, -60.0]]}}, 3000),
+        ({"screen": {"tilt": [0.0, 30.0]}}, 3000),
+        ({"screen": {"radius": [45.0, 45.0]}}, 3000),
+        ({"lens": {"mirror": True}}, SINGLE_SPANS),  # whose rays are intersected one by one
+        ({"element": {"list": [{"z": 60.0, "size": [30.0, 30.0], "radius": [90.0, -90.0]}]}}, SINGLE_SPANS),
+        ({"lens": {"gradient": "radial", "gradient_terms": [-1e-3]}}, SINGLE_SPANS),
+    ],
+)
+def test_pictures_with_gaps_have_a_fine_net_in_any_scene(scene, spans):
+    assert complete({"design": {"waves": "off"}, **scene}, 1.0, gaps=1.0).lens.control == (spans + 3, spans + 3)
 
 
 def test_cells_of_the_start_follow_rays_or_a_fine_net():
     assert transport_cells(4_000_000, False, 500) == 500
     assert transport_cells(4_000_000, False, 2000) == 2000
-    assert transport_cells(1_000_000, True, 2000) == 500  # each cell of a near source's light is solved for
+    assert transport_cells(1_000_000, True, 2000) == 2000
+    assert transport_cells(1_000_000, True, 500) == 500
 
 
 def test_after_a_transport_start_heights_are_refined_without_a_preconditioner():

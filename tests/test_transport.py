@@ -320,7 +320,9 @@ def test_cells_fill_the_rectangle():
     def areas(psi):
         _, site = laguerre.envelope(psi, rows, first, y2, *raster)
         net = laguerre.borders(site, len(psi))
-        return net, laguerre.cells(psi, y1, y2, site, *net, np.full((1, 1), 0.25), np.full((1, 1), 0.25), 1.0, 1.0, transport.WHOLE)
+        return net, laguerre.cells(
+            psi, y1, y2, site, site, *net, np.full((1, 1), 0.25), np.full((1, 1), 0.25), 1.0, 1.0, transport.WHOLE
+        )
 
     net, (mass, weight) = areas(psi)
     assert mass.sum() == pytest.approx(1.0, abs=1e-4)
@@ -332,6 +334,26 @@ def test_cells_fill_the_rectangle():
         assert slope[net[2][e]] == pytest.approx(weight[e], abs=2e-3)
         e = net[1][e]
     assert slope[p] < 0
+
+
+def test_cells_fill_a_source_with_a_dark_edge():
+    """Also narrow ones that the raster sees at a point: all vertices of a cell are cut where the raster gives them to another one,
+    those beyond the edge as well, which fill the source twice otherwise."""
+    g, half = np.random.default_rng(8), 0.9
+    rows, per = np.linspace(-1, 1, 60), 60
+    first, y1 = np.arange(61) * per, np.repeat(rows, per)
+    y2 = np.sort(g.uniform(-1, 1, (60, per)), 1).ravel()
+    psi = 0.5 * (y1**2 + y2**2) + 4e-4 * g.standard_normal(len(y1))
+    raster = [transport.centres(200, 1.0)] * 2
+    sides = np.array([[1.0, 0.0, half], [-1.0, 0.0, half], [0.0, 1.0, half], [0.0, -1.0, half]])
+    _, site = laguerre.envelope(psi, rows, first, y2, *raster)
+    x1, x2 = raster[0][:, None], raster[1]
+    seen = np.where(np.maximum(abs(x1), abs(x2)) <= half, site, np.int32(-1))
+    even = np.full((1, 1), 0.25)
+    mass = laguerre.cells(psi, y1, y2, site, seen, *laguerre.borders(seen, len(psi)), even, even, 1.0, 1.0, sides)[0]
+    points = np.bincount(seen[seen >= 0], minlength=len(psi)) * 0.25 * (2.0 / 200) ** 2
+    assert mass.sum() == pytest.approx(half**2, abs=2e-3)
+    assert np.abs(mass - points).max() < 6e-4
 
 
 def test_a_finer_map_is_the_same_with_sharper_kinks():

@@ -166,7 +166,7 @@ def transport_cells(rays: int, scattered: bool, spans: int = 0, least: int = STA
 
     Discretisation errors of the cells appear as stripes in dark regions, and take many iterations to smooth.
     """
-    if spans >= FINE_SPANS and not scattered:
+    if spans >= FINE_SPANS:
         return spans
     return min(MOST_CELLS, max(least, round(math.sqrt(rays * (4 if scattered else 1)) / RAYS_PER_CELL)))
 

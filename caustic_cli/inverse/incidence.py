@@ -48,6 +48,8 @@ EDGE, PASSES = 65, 3
 STEEPEST = 0.6
 #: Most Newton iterations for (a, b), and their tolerance in parts of the half width of the lens.
 TRACED_STEPS, FOUND = 12, 1e-7
+#: Corners that are traced at a time, for their memory.
+CORNERS = 1 << 17
 
 
 def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
@@ -102,23 +104,33 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
         raise InputError(
             "⟨element.radius⟩: the lenses before the lens focus their light inside it; transport needs an extended beam on its exit"
         )
+
+    def aimed(goal: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Of rays that arrive at points (2, N) of heights z, (9, N): whether they were found, where they cross the pupil, their
+        directions in the glass, their points on the entrance, and their transmittance."""
+        at, left = goal / grown[:, None], np.arange(z.size)
+        for _ in range(TRACED_STEPS):  # of the corners not converged; those that no ray reaches remain
+            near = at[:, None, left] + _STEP * middle[:, :, None]
+            here, by_a, by_b = np.moveaxis(arrive(near, np.stack([z[left]] * 3))[0], 1, 0)
+            ja, jb, off = (by_a - here) / _STEP, (by_b - here) / _STEP, goal[:, left] - here
+            with np.errstate(divide="ignore", invalid="ignore"):
+                area = ja[0] * jb[1] - ja[1] * jb[0]
+                move = np.stack([jb[1] * off[0] - jb[0] * off[1], ja[0] * off[1] - ja[1] * off[0]]) / area
+            finite = np.isfinite(move).all(0)
+            at[:, left] += np.where(finite, move, 0.0)
+            left = left[~finite | (np.abs(off).max(0) > FOUND * max(lens.half_size))]
+            if not len(left):
+                break
+        known = np.ones(z.size, dtype=bool)
+        known[left] = False
+        _, d, entered, part = arrive(at, z)
+        return np.concatenate([known[None], at, d, entered, part[None]])
+
     shape, flat = z.shape, z.ravel()
     goal = np.stack([c.ravel() for c in np.broadcast_arrays(x[:, None], y[None, :])])
-    at, left = goal / grown[:, None], np.arange(z.size)
-    for _ in range(TRACED_STEPS):  # of the corners not converged; those that no ray reaches remain
-        here, by_a, by_b = np.moveaxis(arrive(at[:, None, left] + _STEP * middle[:, :, None], np.stack([flat[left]] * 3))[0], 1, 0)
-        ja, jb, off = (by_a - here) / _STEP, (by_b - here) / _STEP, goal[:, left] - here
-        with np.errstate(divide="ignore", invalid="ignore"):
-            move = np.stack([jb[1] * off[0] - jb[0] * off[1], ja[0] * off[1] - ja[1] * off[0]]) / (ja[0] * jb[1] - ja[1] * jb[0])
-        known = np.isfinite(move).all(0)
-        at[:, left] += np.where(known, move, 0.0)
-        left = left[~known | (np.abs(off).max(0) > FOUND * max(lens.half_size))]
-        if not len(left):
-            break
-    _, d, entered, part = arrive(at, flat)
-    known = np.ones(z.size, dtype=bool)
-    known[left] = False
-    known, at, d, entered, part = (c.reshape(*c.shape[:-1], *shape) for c in (known, at, d, entered, part))
+    found = [aimed(goal[:, k : k + CORNERS], flat[k : k + CORNERS]) for k in range(0, z.size, CORNERS)]
+    known, at, d, entered, part = np.split(np.concatenate(found, axis=1).reshape(9, *shape), [1, 3, 6, 8])
+    known, part = known[0] > 0.0, part[0]
     ga, gb = (np.gradient(c, x, y) for c in at)
     power = part * np.abs(ga[0] * gb[1] - ga[1] * gb[0])
     for where, aperture in ((at, pupil.aperture), (entered, lens.opening)):

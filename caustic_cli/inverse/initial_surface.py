@@ -29,7 +29,6 @@ from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Proj
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import cell_lines, cell_means, corners
 from caustic_cli.optics.interface import slopes_inside
-from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Aperture, Component, Lens, Scene
@@ -158,12 +157,14 @@ class _Grid:
             **options,
         )
 
-    def sharper(self, found: MappedSurface, times: int) -> tuple[_Grid, np.ndarray]:
-        """A grid of cells `times` finer, and the heights there of a surface solved on this grid, with sharper creases."""
+    def sharper(self, found: MappedSurface, directions, times: int) -> tuple[_Grid, np.ndarray]:
+        """A grid of cells `times` finer, and the heights there of a surface solved on this grid with light of these directions,
+        with sharper creases."""
         scene, mean = self.scene, float(found.heights.mean())
         x, y = (corners(times * (len(c) - 1), c[-1]) for c in (self.x, self.y))
         fine = _Grid(self.whole, self.target, x, y, self.middle)
-        _, directions = fine.incident(self.scaled(found.heights, fine))
+        if directions is not None:
+            directions = tuple(self.scaled(c, fine) for c in directions)
         projection = self.projection(mean)
         centre = scene.screen.shift if projection is None else projection.projected_target(self.target)[2]
         index = scene.lens.effective_index
@@ -206,11 +207,14 @@ class _Grid:
         on = (np.abs(u) <= screen.half_size[0]) & (np.abs(v) <= screen.half_size[1])
         return float((light * self.above(z) * cell_means(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
 
-    def truncated(self, z: np.ndarray, middle: float, passes: int, potential: np.ndarray | None = None) -> _TruncatedSurface:
+    def truncated(
+        self, z: np.ndarray, middle: float, passes: int, potential: np.ndarray | None = None, **options
+    ) -> _TruncatedSurface:
         """The surface of this vertex height that maps all light in reach to the picture, truncated at the least thickness.
 
         Args:
             z, potential: initial heights, and the initial potential of their map, mm^2, where one is known.
+            options: of `transport.solve`.
 
         Raises:
             InputError: no light can be refracted to the picture.
@@ -224,7 +228,7 @@ class _Grid:
                 if not lit.max() > 0:
                     raise InputError(UNREACHED)
                 try:
-                    found = self.solved(lit, directions, float(z.mean()), potential)
+                    found = self.solved(lit, directions, float(z.mean()), potential, **options)
                     break
                 except OutOfReach as error:
                     if not left:
@@ -232,17 +236,23 @@ class _Grid:
                     reached = reached * cell_means((~error.where).astype(float))
             z, potential = found.heights, found.transport.potential
         z = z + middle - _middle(z)
-        return _TruncatedSurface(z, middle, max(0.0, self.floor - float(z.min())), potential)
+        return _TruncatedSurface(replace(found, heights=z), directions, middle, max(0.0, self.floor - float(z.min())))
 
 
 @dataclass(frozen=True, eq=False)
 class _TruncatedSurface:
-    """A surface before truncation: heights, vertex height, how far it extends below the truncation, mm; its potential, mm^2."""
+    """A surface before truncation; directions of the light that it is for; vertex height, how far it extends below the truncation,
+    mm."""
 
-    z: np.ndarray
+    mapped: MappedSurface
+    directions: tuple | None
     middle: float
     short: float
-    potential: np.ndarray
+
+    @property
+    def z(self) -> np.ndarray:
+        """Its heights, mm."""
+        return self.mapped.heights
 
 
 def _rough_surface(scene: Scene, target: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
@@ -271,7 +281,7 @@ def first_surface(
         scene: source, lens and screen.
         target: (n_x, n_y) irradiance on its screen.
         field: spline spaces of the heights.
-        cells: source cells along the lens' longer side; more than SOLVED sharpen creases, for distant sources.
+        cells: source cells along the lens' longer side; more than SOLVED sharpen creases.
         fixed: the thickness is given by the user, and no other is tried.
         seconds: approximate time allowed for a near source, which limits its cells.
         few: cells on which the vertex height is chosen for such a source.
@@ -281,39 +291,44 @@ def first_surface(
     """
     began = time.monotonic()
     scene, target = seen_by_light(scene, target)
-    finer_cells = scene.source.distant and not medium_of(scene.lens).varies  # rays to so many corners would take minutes
-    times, options = _refinement(cells, target) if finer_cells else 1, {}
-    cells = min(cells, SOLVED * times)
+    times, options = _refinement(cells, target), {}
+    cells = min(cells, SOLVED * times) // times
     if times > 1:
         options = {"tolerance": EXACT, "most": STEPS}
-    grid, lens = _Grid.of(scene, target, cells // times), scene.lens
+    grid, lens = _Grid.of(scene, target, cells), scene.lens
     z = grid.offset
     if scene.source.oblique:  # the shadow of the lens' sides depends on the heights
         surface = _rough_surface(scene, target)
-        grid = _Grid.of(scene, target, cells // times, surface)
+        grid = _Grid.of(scene, target, cells, surface)
         z = surface(*grid.places)
     if scene.source.distant or lens.mirror or scene.elements:
         found = None
         for _ in range(1 if scene.source.distant and not is_traced(scene) else PASSES):
             known = None if found is None else found.transport.potential
-            found = grid.solved(*grid.incident(z), float(z.mean()), known, **options)
+            light, directions = grid.incident(z)
+            found = grid.solved(light, directions, float(z.mean()), known, **options)
             z = found.heights
         if times > 1:
-            grid, z = grid.sharper(found, times)
+            grid, z = grid.sharper(found, directions, times)
         return InitialSurface(net_of(*grid.places, z, field))
     coarse = _Grid.of(scene, target, min(cells, few))
     found = _best(coarse, lens.offset.thickness, fixed)
     within = cells
-    for most, passes in ((round(math.sqrt(few * cells)), PASSES - 1), (cells, 1)):
+    for most, passes, exactly in ((round(math.sqrt(few * cells)), PASSES - 1, {}), (cells, 1, options)):
         n, started = min(most, within), time.monotonic()
         if n < max(len(coarse.x), len(coarse.y)):
             continue
         fine = _Grid.of(scene, target, n)
-        found = fine.truncated(coarse.scaled(found.z, fine), found.middle, passes, coarse.scaled(found.potential, fine))
+        known = coarse.scaled(found.mapped.transport.potential, fine)
+        found = fine.truncated(coarse.scaled(found.z, fine), found.middle, passes, known, **exactly)
         coarse, now = fine, time.monotonic()
         left = max(0.0, seconds - (now - began))  # the time of a pass is proportional to the number of cells
         within = int(min(cells, n * math.sqrt(left * passes / (now - started))))
-    net = net_of(coarse.x, coarse.y, np.maximum(found.z, coarse.floor), field)
+    z = found.z
+    if times > 1:
+        coarse, z = coarse.sharper(found.mapped, found.directions, times)
+        z = z + found.middle - _middle(z)
+    net = net_of(*coarse.places, np.maximum(z, coarse.floor), field)
     return InitialSurface(net.clamp_min(coarse.floor), found.middle)  # the spline undershoots at a kink
 
 

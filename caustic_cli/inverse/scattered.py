@@ -128,9 +128,9 @@ class Pixels:
     project: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
     centre: tuple[float, float] = (0.0, 0.0)
 
-    def sites(self, source: np.ndarray, source_half: tuple[float, float]) -> Scattered:
-        """The point masses of this picture for a source of these cells."""
-        x, y, mass = point_masses(source, self.power, self.half)
+    def sites(self, source: np.ndarray, source_half: tuple[float, float], fewer: int = 1) -> Scattered:
+        """The point masses of this picture for a source of these cells, or `fewer` times fewer."""
+        x, y, mass = point_masses(source, self.power, self.half, fewer=fewer)
         if self.project:
             x, y = (c - middle for c, middle in zip(self.project(x, y), self.centre, strict=True))
         return Scattered(x, y, mass, source_half, np.stack([x, y]))

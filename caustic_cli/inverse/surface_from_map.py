@@ -50,6 +50,8 @@ KINK = 3.0  # stretch of the map, in its median, from which e is not that of T: 
 NEGLIGIBLE = 0.05  # RMS of e, pixels, that is not corrected
 #: Options of the first map onto pixels in a projection, from which e is known: a quarter of the sites.
 ROUGHLY = {"tolerance": 1e-2, "most": 10, "levels": LEVELS[:-1]}
+#: By what factor the point masses are fewer of which the first map with displaced ones is found, and its options.
+FEWER, FEW = 4, {"tolerance": 1e-2, "most": 30}
 REPEATS = 4  # most fixed-point iterations; each reduces the error by a factor of about angle^2 / throw
 CONVERGED = 1e-10  # largest expected change of a height in the next iteration, mm
 ROWS = 64  # of corners processed at a time, so that intermediate arrays fit in the cache
@@ -131,6 +133,7 @@ def surface(
     options.pop("start", None)
     x, y = corners(shape[0], half[0])[:, None], corners(shape[1], half[1])[None, :]
     light, pixel = _at_corners(source), min(2.0 * h / s for h, s in zip(target_half, np.shape(target), strict=True))
+    masses = pixels or Pixels(np.asarray(target), target_half)
     aim, shift = (map_.x + centre[0], map_.y + centre[1]), np.zeros((2, *light.shape))
     for again in range(corrections + 1):
         z = heights(map_, aim, x, y, d, index, z_screen, thickness, light > 0, projection)
@@ -144,9 +147,12 @@ def surface(
         if settled and projection and projection.aligned:
             map_ = solve(source, target, half, target_half, start=map_.potential, **options)
         else:
-            known = map_.solved.sites if shift.any() else (pixels or Pixels(np.asarray(target), target_half)).sites(source, half)
-            shift += off
-            map_ = solve_displaced(source, known, half, map_.potential, shift, **options)
+            first, shift, start = not shift.any(), shift + off, None
+            if first and rough:
+                some = masses.sites(source, half, FEWER)
+                start = solve_displaced(source, some, half, map_.potential, shift, **{**options, **FEW}, fewer=FEWER).potential
+            known = masses.sites(source, half) if first else map_.solved.sites
+            map_ = solve_displaced(source, known, half, map_.potential, shift, start=start, **options)
         rough = False
         aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
     return MappedSurface(z, *landing, miss, shift, again, map_, time.perf_counter() - began)

@@ -52,6 +52,7 @@ SEEN, MANY = 8, 4096  # FINE at least; beyond that, at most so many points along
 #: Transport error at which sites whose cells the raster misses are merged with neighbours, for convergence; most repetitions.
 MERGED, ROUNDS = 5e-3, 4
 STRICTER = 0.2  # tolerance of scattered sites in that of others: what is left is the light of a few, at the edge of the source
+LEAST_ERROR = 4e-4  # of scattered sites, below which Newton's method mostly empties and fills a few cells at the edge
 COVERED = 0.99  # part of the scattered sites that move by no more than the map is widened for its first prices
 LEAST = 128  # raster points along an axis
 LEVELS = (64, 16, 4, 1)  # ratios of the number of sites on the finest level to that on each level
@@ -256,7 +257,18 @@ def solve(
 
 
 def solve_displaced(
-    source, sites: _Sites, source_half, potential, shift, *, smooth=1.5, tolerance=5e-3, most=10, darkest=DARKEST
+    source,
+    sites: _Sites,
+    source_half,
+    potential,
+    shift,
+    *,
+    smooth=1.5,
+    tolerance=5e-3,
+    most=10,
+    darkest=DARKEST,
+    start=None,
+    fewer=1,
 ) -> Transport:
     """The same onto scattered point masses, each displaced from its own place by -shift at the point of the source that a similar
     map sends to it.
@@ -265,6 +277,8 @@ def solve_displaced(
         sites: of `scattered`, where they are in that map.
         potential: its potential on the same source cells, (n + 1, m + 1) mm^2, and shift (2, n + 1, m + 1) mm there.
         source, source_half, smooth, tolerance, most, darkest: as of `solve`.
+        start: potential of their map, roughly, there.
+        fewer: by what factor the sites are fewer than those of the finest level.
     """
     began = time.perf_counter()
     kernels.blocks()
@@ -272,7 +286,7 @@ def solve_displaced(
     shape = f.shape
     f, sides = _lit_part(f, a, b)
     f = _normalised(f, darkest, (a, b))
-    raster = [centres(max(FINE * n, LEAST), h) for n, h in zip(shape, (a, b), strict=True)]
+    raster = [centres(max(round(FINE * n * fewer**-0.5), LEAST), h) for n, h in zip(shape, (a, b), strict=True)]
     phi = _resampled(potential, shape, (a, b), raster)
     light = _light(f, 0.0, raster, a, b, sides)
     at = sites.prices(phi, raster, light.inside)[1]
@@ -280,9 +294,14 @@ def solve_displaced(
     cells = [(0.5 * x / h + 0.5) * n for x, n, h in zip(where, shape, (a, b), strict=True)]
     moved = sites.displaced(*(-ndimage.map_coordinates(c, cells, order=1, mode="nearest") for c in shift))
     spread = [np.quantile(np.abs(d), COVERED) / h for d, h in zip((moved.y1 - sites.y1, moved.y2 - sites.y2), (a, b), strict=True)]
-    phi = phi + 0.5 * (spread[0] * raster[0][:, None] ** 2 + spread[1] * raster[1] ** 2)  # whose map reaches the outermost sites
+    if start is None:
+        phi = phi + 0.5 * (
+            spread[0] * raster[0][:, None] ** 2 + spread[1] * raster[1] ** 2
+        )  # whose map reaches the outermost sites
+    else:
+        phi = _resampled(start, shape, (a, b), raster)
     psi = moved.prices(phi, raster, light.inside)[0]
-    psi, error, taken = _newton(psi, moved, raster, light, STRICTER * tolerance, most)
+    psi, error, taken = _newton(psi, moved, raster, light, max(LEAST_ERROR, STRICTER * tolerance), most)
     return _map(psi, moved, shape, (a, b), smooth, error, taken, began)
 
 
@@ -305,10 +324,11 @@ def _map(psi, sites: _Sites, shape, half, smooth: float, error: float, steps: in
     return Transport(potential - potential.mean(), x, y, error, len(psi), steps, time.perf_counter() - began, solved)
 
 
-def point_masses(source, picture, half, darkest=DARKEST) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The point masses of the finest level for a picture (k, l) with half sizes in mm: y1, y2 mm and masses, (N,) each."""
+def point_masses(source, picture, half, darkest=DARKEST, fewer=1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The point masses of the finest level for a picture (k, l) with half sizes in mm, or about `fewer` times fewer: y1, y2 mm and
+    masses, (N,) each."""
     f, half = _density("source", source), _halves("target", half)
-    most = _most_sites(_normalised(f, darkest, (1.0, 1.0)), f.size)
+    most = _most_sites(_normalised(f, darkest, (1.0, 1.0)), f.size) // fewer
     sites = _sites(_pyramid(_density("target", picture), half, most), 1.0 / max(most, 16))
     return sites.y1, sites.y2, sites.mass
 
@@ -527,7 +547,7 @@ def _cells(psi: np.ndarray, sites: _Sites, raster: list, light: _Light) -> tuple
     phi, site = envelope.on(*raster)
     seen = light.seen(site)
     net = envelope.borders(seen)
-    mass, weight = laguerre.cells(psi, sites.y1, sites.y2, seen, *net, *light[:-1])
+    mass, weight = laguerre.cells(psi, sites.y1, sites.y2, site, seen, *net, *light[:-1])
     if light.inside is not None and (total := mass.sum()):
         mass, weight = mass / total, weight / total
     empty = mass == 0.0

@@ -10,7 +10,7 @@ from typing import Any
 
 from caustic_cli.config.default_stages import RAYS_PER_PIXEL, Table, completed_stage, usual_sampler
 from caustic_cli.config.design import region_of, relative_to_initial
-from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen
+from caustic_cli.config.settings import Settings, build_scene
 from caustic_cli.effort import DRAFT, EFFORTS, FINE, STANDARD, Effort, current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.source_limits import point_source, points_of, source_spread
@@ -129,6 +129,11 @@ class Defaults:
         """Whether the source's extent only shifts the image."""
         return source_spread(self._scene) is not None
 
+    @property
+    def by_rows(self) -> bool:
+        """Whether rays of the source's centre are not intersected with the surface one by one."""
+        return evaluates_by_rows(self._scene)
+
     def fewer_rays(self, spread: bool) -> int:
         """By what factor rays are fewer than those of a plane wave: where every one has to be intersected with the surface, and of
         a near source, whose start takes longer the more there are; spread: those of the source's centre are traced."""
@@ -144,9 +149,8 @@ class Defaults:
     @property
     def _scene(self) -> Scene:
         """The scene with some control net."""
-        s = self.s
-        lens = build_lens(s.lens.filled(control=[LEAST_SPANS] * 2))
-        return Scene(self.source, lens, build_screen(s.screen), build_light(s))
+        lens = self.s.lens.filled(control=[LEAST_SPANS] * 2)
+        return replace(build_scene(self.s.changed(lens=lens)), source=self.source)
 
     def complete_given_stages(self) -> bool:
         """Complete stages of the user's own; False if there are none."""

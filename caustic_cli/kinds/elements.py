@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from caustic_cli.config.default_stages import Table, refinement
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import departure_bound, sphere_net
@@ -27,14 +26,6 @@ class AmongElements(OneSurface):
     @classmethod
     def spread(cls, d: Defaults) -> bool:
         return False
-
-    @classmethod
-    def creased(cls, d: Defaults, waves: list[Table]) -> bool:
-        return False
-
-    @classmethod
-    def refinement(cls, d: Defaults, creased: bool = False) -> list[Table]:
-        return refinement(d.lens.control, d.rays, d.resolution, d.effort.system)
 
     def _bounds(self, k: int) -> tuple[Tensor, Tensor]:
         low, high = super()._bounds(k)

@@ -62,8 +62,7 @@ class LensletArray(OneSurface):
     @classmethod
     def complete_control(cls, d: Defaults) -> None:
         super().complete_control(d)
-        control = d.lens.control
-        fits = [array_control(n, p, k) if k > 1 else n for n, p, k in zip(control, d.lens.degree, d.lens.array, strict=True)]
+        control, fits = d.lens.control, cls.fitting(d)
         if d.own_control and fits != list(control):
             raise InputError(
                 "⟨lens.control⟩ of an array must be lenslets times (spans + degree - 1) and one more along each axis, such as"
@@ -71,9 +70,21 @@ class LensletArray(OneSurface):
             )
         d.set_control(fits)
 
+    @staticmethod
+    def fitting(d: Defaults) -> list[int]:
+        """The control net next to that set so far that lenslets share."""
+        return [array_control(n, p, k) if k > 1 else n for n, p, k in zip(d.lens.control, d.lens.degree, d.lens.array, strict=True)]
+
+    @classmethod
+    def creased(cls, d: Defaults, waves: list[Table]) -> bool:
+        creased = super().creased(d, waves)
+        if creased:
+            d.set_control(cls.fitting(d))
+        return creased
+
     @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
-        stages = cls.refinement(d)
+        stages = cls.refinement(d, cls.creased(d, waves))
         if d.s.target.sheet:
             stages = each_lenslet(stages, math.prod(d.lens.array), d.resolution)
         return stages

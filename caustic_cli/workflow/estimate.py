@@ -76,12 +76,12 @@ SECONDS = Work(6.46, 1.14, 0.0359, 0.0298, 0.02, 0.0224, 0.00545)
 MIBS = (765.0, 231.0, 88.3)
 #: Judge and quality -> coefficients of `features_of`, and the standard deviation of the logarithm of the error about them.
 ERRORS: dict[tuple[str, str], tuple[tuple[float, ...], float]] = {
-    ("waves", "draft"): ((-1.124, 0.622, -0.03, -0.012), 0.173),
-    ("waves", "standard"): ((-2.796, 0.772, -0.065, 0.622), 0.391),
-    ("waves", "fine"): ((-1.523, 0.945, 0.118, 0.0), 0.566),
-    ("rays", "draft"): ((-2.429, 0.311, 0.037, 0.001), 0.197),
-    ("rays", "standard"): ((-2.524, 0.395, 0.298, 0.216), 0.247),
-    ("rays", "fine"): ((-2.2, 0.399, 0.345, 0.0), 0.18),
+    ("waves", "draft"): ((-1.124, 0.622, -0.03, -0.012, 0.0), 0.173),
+    ("waves", "standard"): ((-2.796, 0.772, -0.065, 0.622, 0.0), 0.391),
+    ("waves", "fine"): ((-1.523, 0.945, 0.118, 0.0, 0.0), 0.566),
+    ("rays", "draft"): ((-2.429, 0.311, 0.037, 0.001, 0.0), 0.197),
+    ("rays", "standard"): ((-2.524, 0.395, 0.298, 0.216, 0.0), 0.247),
+    ("rays", "fine"): ((-2.2, 0.399, 0.345, 0.0, 0.0), 0.18),
 }
 
 
@@ -107,7 +107,8 @@ def work_of(problem: OneSurface, samples: float) -> Work:
 
 def features_of(problem: OneSurface, size: tuple[float, float]) -> np.ndarray:
     """1, and logarithms of what decides how good a lens is: of the detail of the picture, its relative RMS difference to itself
-    blurred by a pixel; of the bright part of it; and of the blur by diffraction over the pixel.
+    blurred by a pixel; of the bright part of it; of the blur by diffraction over the pixel; and of its contrast, the relative RMS
+    difference to its mean.
 
     size: of the picture, mm.
     """
@@ -115,7 +116,8 @@ def features_of(problem: OneSurface, size: tuple[float, float]) -> np.ndarray:
     detail = float(np.sqrt(np.mean((target - gaussian_filter(target, 1.0)) ** 2)) / target.mean())
     bright = float(np.mean(target > 0.02 * target.max()))
     seen = Resolution.before(problem.scene, size)
-    return np.array([1.0, math.log(max(detail, 1e-3)), math.log(bright), math.log(max(seen.diffraction / seen.pixel, 1e-3))])
+    blur, contrast = seen.diffraction / seen.pixel, float(target.std() / target.mean())
+    return np.array([1.0, *(math.log(max(value, 1e-3)) for value in (detail, bright, blur, contrast))])
 
 
 def cut_off_error(problem: OneSurface) -> float:

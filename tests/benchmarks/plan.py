@@ -31,7 +31,7 @@ QUALITIES = ("draft", "standard", "fine")
 #: Options of further scenes, each of the first pictures.
 SCENES = (("--mag", "1.5"), ("--resolution", "128"), ("--lens-size", "20"), ("--throw", "150"))
 #: Ridge of the regression: the figures of pictures are alike.
-RIDGE = 0.05
+RIDGE = 0.005
 RESULTS = "designs.jsonl"
 
 

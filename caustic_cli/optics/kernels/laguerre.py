@@ -347,11 +347,11 @@ def _means(site, values, sites):
     return total[1:] / np.maximum(count[1:], 1)
 
 
-def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b, sides):
+def cells(psi, y1, y2, site, seen, head, link, end, degree, f, values, a, b, sides):
     """Mass of every cell and d(mass) across every border.
 
     Args:
-        site: on a raster, -1 outside the source; head, link, end, degree: of `borders`.
+        site: on a raster; seen: the same, -1 outside the source; head, link, end, degree: of `borders` of `seen`.
         sides: of a convex source, (k, 3) unit outer normals and distances from the origin, none for the whole rectangle.
 
     Returns:
@@ -359,7 +359,7 @@ def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b, sides):
         weight (half-borders,): f times the border's length over the sites' distance, the derivative of the mass by the
         difference of the two prices (Kitagawa, Merigot & Thibert, J. Eur. Math. Soc. 21, 2019, theorem 1.3).
     """
-    mass, weight, level = np.zeros(len(psi)), np.zeros(len(end)), _means(site, values, len(psi))
+    mass, weight, level = np.zeros(len(psi)), np.zeros(len(end)), _means(seen, values, len(psi))
     _cells(ALL, psi, y1, y2, site, head, link, end, degree, f, level, a, b, sides, mass, weight)
     return mass, weight
 
@@ -390,18 +390,6 @@ def _cells(task, psi, y1, y2, site, head, link, end, degree, f, level, a, b, sid
             n = _clip(px, py, po, n, y1[q] - y1[p], y2[q] - y2[p], psi[q] - psi[p], e, qx, qy, qo)
             px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
             e = link[e]
-        k, missed = 0, 0
-        while k < n and missed < MISSED:  # a vertex that the raster gives to someone else: cut there too
-            i = min(max(int((px[k] + a) * (0.5 * rn / a)), 0), rn - 1)
-            j = min(max(int((py[k] + b) * (0.5 * rm / b)), 0), rm - 1)
-            q, k = site[i, j], k + 1
-            if q < 0:
-                continue
-            ax, ay, c = y1[q] - y1[p], y2[q] - y2[p], psi[q] - psi[p]
-            if q != p and ax * px[k - 1] + ay * py[k - 1] - c > 1e-9 * abs(c):
-                n = _clip(px, py, po, n, ax, ay, c, np.int32(-1), qx, qy, qo)
-                px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
-                k, missed = 0, missed + 1
         for e in range(len(sides)):
             ax, ay, c = sides[e, 0], sides[e, 1], sides[e, 2]
             outside = False
@@ -410,6 +398,16 @@ def _cells(task, psi, y1, y2, site, head, link, end, degree, f, level, a, b, sid
             if outside:
                 n = _clip(px, py, po, n, ax, ay, c, np.int32(-1), qx, qy, qo)
                 px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
+        k, missed = 0, 0
+        while k < n and missed < MISSED:  # a vertex that the raster gives to someone else: cut there too
+            i = min(max(int((px[k] + a) * (0.5 * rn / a)), 0), rn - 1)
+            j = min(max(int((py[k] + b) * (0.5 * rm / b)), 0), rm - 1)
+            q, k = site[i, j], k + 1
+            ax, ay, c = y1[q] - y1[p], y2[q] - y2[p], psi[q] - psi[p]
+            if q != p and ax * px[k - 1] + ay * py[k - 1] - c > 1e-9 * abs(c):
+                n = _clip(px, py, po, n, ax, ay, c, np.int32(-1), qx, qy, qo)
+                px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
+                k, missed = 0, missed + 1
         area = _area(px, py, n)
         if not area > 0.0:
             continue
