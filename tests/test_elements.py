@@ -14,6 +14,7 @@ import torch
 from helpers import begun
 from PIL import Image
 from rayfiles import cone_of, tm25
+from scipy.ndimage import maximum_filter
 
 from caustic_cli import cli, load
 from caustic_cli.errors import InputError
@@ -482,15 +483,30 @@ def test_light_through_a_field_lens_is_that_of_traced_rays():
     scene = replace(SCENE, source=Points(((0.5, 0.0, -90.0),)), elements=(thick(-25.0, 10.0, (40.0, -200.0)),))
     line = np.linspace(-5.0, 5.0, 21)
     light, directions = incident(scene, line, line, np.full((21, 21), 5.0))
-    found = []
-    for rays in rays_of(scene, "stratified", 400_000, 2).chunks(1 << 20):
-        (state,) = Tracer(System.of(scene, FIELD), rays)({EXIT: torch.full((35, 35), 5.0, dtype=torch.float64)})
-        found.append(np.histogram2d(*(c.numpy() for c in state.origin[:2]), bins=[line, line], weights=state.power.numpy())[0])
-    counted = np.sum(found, axis=0)
+    counted = counted_light(scene, line)
     bright = counted > 0.3 * counted.max()
     light, counted = light / light.sum(), counted / counted.sum()
     assert bright.sum() > 100 and np.abs(light[bright] / counted[bright] - 1.0).mean() < 0.05
     assert all(np.isfinite(c).all() for c in directions)
+
+
+def counted_light(scene: Scene, line: np.ndarray) -> np.ndarray:
+    """Power on cells of a plane exit, by counting rays."""
+    found = []
+    for rays in rays_of(scene, "stratified", 400_000, 2).chunks(1 << 20):
+        (state,) = Tracer(System.of(scene, FIELD), rays)({EXIT: torch.full((35, 35), 5.0, dtype=torch.float64)})
+        found.append(np.histogram2d(*(c.numpy() for c in state.origin[:2]), bins=[line, line], weights=state.power.numpy())[0])
+    return np.sum(found, axis=0)
+
+
+def test_light_is_bounded_by_all_apertures_before_the_lens():
+    """Of diverging light a lens' second surface passes less than its first, of the same diameter."""
+    led = Points(((0.0, 0.0, -80.0),), cone=9.0)
+    scene = replace(SCENE, source=led, elements=(thick(-40.0, 8.0, (math.inf, -20.0), 8.0, 1.5, aperture="circle"),))
+    line = np.linspace(-5.0, 5.0, 51)
+    light, counted = incident(scene, line, line, np.full((51, 51), 5.0))[0], counted_light(scene, line)
+    reached = maximum_filter(counted, 3) > 0.0
+    assert 0.4 < reached.mean() < 0.7 and light[~reached].sum() < 1e-3 * light.sum()
 
 
 def test_effects_know_of_all_glasses_and_apertures():

@@ -102,7 +102,7 @@ def test_what_cannot_be_planned_is_refused(capfd, arguments, words):
 
 def test_a_design_for_an_error_takes_the_cheapest_and_stops_there(capfd, monkeypatch):
     fixed = {
-        (by, q): ((np.log(e), 0.0, 0.0, 0.0), 0.1)
+        (by, q): ((np.log(e), 0.0, 0.0, 0.0, 0.0), 0.1)
         for by in ("rays", "waves")
         for q, e in zip(estimate.QUALITIES, (0.9, 0.05, 0.01), strict=True)
     }
@@ -122,7 +122,7 @@ def test_a_design_for_an_error_takes_the_cheapest_and_stops_there(capfd, monkeyp
 
 
 def test_a_design_goes_on_and_says_what_no_quality_reaches(monkeypatch):
-    fixed = {(by, q): ((np.log(0.01), 0.0, 0.0, 0.0), 0.1) for by in ("rays", "waves") for q in estimate.QUALITIES}
+    fixed = {(by, q): ((np.log(0.01), 0.0, 0.0, 0.0, 0.0), 0.1) for by in ("rays", "waves") for q in estimate.QUALITIES}
     monkeypatch.setattr(estimate, "ERRORS", fixed)
     said: list[str] = []
     qualities = estimate.cheapest(Path("blob.png"), {"screen.resolution": (24, 24)}, 0.02, Listener(on_message=said.append))

@@ -31,6 +31,7 @@ from caustic_cli.inverse.transport import cell_means
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance, slopes_inside
 from caustic_cli.optics.media import medium_of
+from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
 from caustic_cli.scene import Aperture, CircularAperture, Scene
@@ -82,15 +83,21 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     """`incident` over the whole rectangle, traced through the lenses before the lens and in its medium."""
     pupil, lens, whole = scene.pupil, scene.lens, System.of(without_freeforms(scene))
     names = [e.name for e in whole.elements]
-    system = without_apertures(whole, 0, names.index(ENTRANCE) + 1)
+    count = names.index(ENTRANCE) + 1
+    system = without_apertures(whole, 0, count)
+    stopped = replace(system, elements=whole.elements[:count])
     first, medium = scene.lowest, medium_of(lens)
+
+    def entering(system: System, at: np.ndarray) -> RayState:
+        """Rays from points (2, N) of the pupil, behind the entrance."""
+        d = _from_source(scene, *at)
+        back = (pupil.z - first) / d[2] + 1e-6  # the first surface may reach through the pupil
+        return trace_through(system, (at[0] - back * d[0], at[1] - back * d[1], pupil.z - back * d[2]), d)
 
     def arrive(at: np.ndarray, z: np.ndarray):
         """Intersections with the heights z of rays from points (2, N) of the pupil, their directions in the glass, their points on
         the entrance, and their transmittance."""
-        d = _from_source(scene, *at)
-        back = (pupil.z - first) / d[2] + 1e-6  # the first surface may reach through the pupil
-        state = trace_through(system, (at[0] - back * d[0], at[1] - back * d[1], pupil.z - back * d[2]), d)
+        state = entering(system, at)
         entered, direction = (tuple(c.double() for c in state.full(v)) for v in (state.origin, state.direction))
         depth = torch.from_numpy(z.ravel() - lens.z_in)
         point, direction = medium.onto_plane((*entered[:2], torch.zeros_like(depth)), direction, depth)
@@ -124,6 +131,7 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
         known = np.ones(z.size, dtype=bool)
         known[left] = False
         _, d, entered, part = arrive(at, z)
+        part = part * (entering(stopped, at).power.numpy() > 0.0)  # by the apertures of all lenses
         return np.concatenate([known[None], at, d, entered, part[None]])
 
     shape, flat = z.shape, z.ravel()

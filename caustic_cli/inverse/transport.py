@@ -294,10 +294,9 @@ def solve_displaced(
     cells = [(0.5 * x / h + 0.5) * n for x, n, h in zip(where, shape, (a, b), strict=True)]
     moved = sites.displaced(*(-ndimage.map_coordinates(c, cells, order=1, mode="nearest") for c in shift))
     spread = [np.quantile(np.abs(d), COVERED) / h for d, h in zip((moved.y1 - sites.y1, moved.y2 - sites.y2), (a, b), strict=True)]
-    if start is None:
-        phi = phi + 0.5 * (
-            spread[0] * raster[0][:, None] ** 2 + spread[1] * raster[1] ** 2
-        )  # whose map reaches the outermost sites
+    if start is None:  # a map that reaches the outermost sites
+        wide, high = spread
+        phi = phi + 0.5 * (wide * raster[0][:, None] ** 2 + high * raster[1] ** 2)
     else:
         phi = _resampled(start, shape, (a, b), raster)
     psi = moved.prices(phi, raster, light.inside)[0]
