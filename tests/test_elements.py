@@ -355,7 +355,7 @@ def test_a_robust_design_moves_the_lens_among_the_elements(_here, capfd):
     problem = problem_of(Project.open("p"))
     assert isinstance(problem, RobustElements)
     heights = problem.all_surfaces(load("p").heights)
-    loss = problem.objective(0, heights)
+    loss = problem.objective(len(problem.stages) - 1, heights)
     draws = [(m.objective.scene.mounting, m.added) for m in loss.members[1:]]
     for ((a, _), one), ((b, _), other) in (draws[:2], draws[2:]):
         assert a == (-b[0], -b[1]) and any(a)

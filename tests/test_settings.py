@@ -326,7 +326,7 @@ def test_a_picture_with_gaps_has_a_net_as_fine_as_its_creases_ask_for():
         ({"screen": {"tilt": [0.0, 30.0]}}, 3000),
         ({"screen": {"radius": [45.0, 45.0]}}, 3000),
         ({"lens": {"mirror": True}}, SINGLE_SPANS),  # whose rays are intersected one by one
-        ({"element": {"list": [{"z": 60.0, "size": [30.0, 30.0], "radius": [90.0, -90.0]}]}}, SINGLE_SPANS),
+        ({"element": {"list": [{"z": 60.0, "size": [20.0, 20.0], "radius": [90.0, -90.0]}]}}, SINGLE_SPANS),
         ({"lens": {"gradient": "radial", "gradient_terms": [-1e-3]}}, SINGLE_SPANS),
     ],
 )

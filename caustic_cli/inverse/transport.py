@@ -300,7 +300,8 @@ def solve_displaced(
     else:
         phi = _resampled(start, shape, (a, b), raster)
     psi = moved.prices(phi, raster, light.inside)[0]
-    psi, error, taken = _newton(psi, moved, raster, light, max(LEAST_ERROR, STRICTER * tolerance), most)
+    enough = min(tolerance, max(LEAST_ERROR, STRICTER * tolerance))
+    psi, error, taken = _newton(psi, moved, raster, light, enough, most)
     return _map(psi, moved, shape, (a, b), smooth, error, taken, began)
 
 
