@@ -71,14 +71,14 @@ class Work(NamedTuple):
 
 
 #: Seconds for a unit of each part on the reference machine.
-SECONDS = Work(6.46, 1.14, 0.0359, 0.0298, 0.02, 0.0224, 0.00545)
+SECONDS = Work(6.68, 1.03, 0.0362, 0.0292, 0.0276, 0.018, 0.00574)
 #: MiB for a unit of each part of `memory_of`.
-MIBS = (765.0, 231.0, 88.3)
+MIBS = (735.0, 233.0, 83.0)
 #: Judge and quality -> coefficients of `features_of`, and the standard deviation of the logarithm of the error about them.
 ERRORS: dict[tuple[str, str], tuple[tuple[float, ...], float]] = {
     ("waves", "draft"): ((-1.124, 0.622, -0.03, -0.012, 0.0), 0.173),
-    ("waves", "standard"): ((-2.796, 0.772, -0.065, 0.622, 0.0), 0.391),
-    ("waves", "fine"): ((-1.523, 0.945, 0.118, 0.0, 0.0), 0.566),
+    ("waves", "standard"): ((-2.928, 0.981, -0.065, 1.288, -0.661), 0.345),
+    ("waves", "fine"): ((-0.686, 1.132, 0.092, 0.0, -0.659), 0.33),
     ("rays", "draft"): ((-2.429, 0.311, 0.037, 0.001, 0.0), 0.197),
     ("rays", "standard"): ((-2.524, 0.395, 0.298, 0.216, 0.0), 0.247),
     ("rays", "fine"): ((-2.2, 0.399, 0.345, 0.0, 0.0), 0.18),
