@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
-from functools import singledispatch
+from dataclasses import dataclass, replace
+from functools import cached_property, singledispatch
 
 import numpy as np
 import torch
@@ -51,6 +51,8 @@ STEEPEST = 0.6
 TRACED_STEPS, FOUND = 12, 1e-7
 #: Corners that are traced at a time, for their memory.
 CORNERS = 1 << 17
+#: A point and two beside it, along x and y, in the steps of finite differences.
+BESIDE = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
@@ -79,64 +81,81 @@ def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
     return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
 
 
-def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
-    """`incident` over the whole rectangle, traced through the lenses before the lens and in its medium."""
-    pupil, lens, whole = scene.pupil, scene.lens, System.of(without_freeforms(scene))
-    names = [e.name for e in whole.elements]
-    count = names.index(ENTRANCE) + 1
-    system = without_apertures(whole, 0, count)
-    stopped = replace(system, elements=whole.elements[:count])
-    first, medium = scene.lowest, medium_of(lens)
+@dataclass(frozen=True, eq=False)
+class _WayToExit:
+    """The light from points of the pupil of a scene, through the lenses before the lens and its medium, to heights of the exit."""
 
-    def entering(system: System, at: np.ndarray) -> RayState:
+    scene: Scene
+
+    @cached_property
+    def systems(self) -> tuple[System, System]:
+        """What lies before the glass, without and with the apertures of all lenses."""
+        whole = System.of(without_freeforms(self.scene))
+        count = [e.name for e in whole.elements].index(ENTRANCE) + 1
+        bare = without_apertures(whole, 0, count)
+        return bare, replace(bare, elements=whole.elements[:count])
+
+    def entering(self, system: System, at: np.ndarray) -> RayState:
         """Rays from points (2, N) of the pupil, behind the entrance."""
-        d = _from_source(scene, *at)
-        back = (pupil.z - first) / d[2] + 1e-6  # the first surface may reach through the pupil
+        pupil, d = self.scene.pupil, _from_source(self.scene, *at)
+        back = (pupil.z - self.scene.lowest) / d[2] + 1e-6  # the first surface may reach through the pupil
         return trace_through(system, (at[0] - back * d[0], at[1] - back * d[1], pupil.z - back * d[2]), d)
 
-    def arrive(at: np.ndarray, z: np.ndarray):
+    def arrive(self, at: np.ndarray, z: np.ndarray):
         """Intersections with the heights z of rays from points (2, N) of the pupil, their directions in the glass, their points on
         the entrance, and their transmittance."""
-        state = entering(system, at)
+        lens, state = self.scene.lens, self.entering(self.systems[0], at)
         entered, direction = (tuple(c.double() for c in state.full(v)) for v in (state.origin, state.direction))
         depth = torch.from_numpy(z.ravel() - lens.z_in)
-        point, direction = medium.onto_plane((*entered[:2], torch.zeros_like(depth)), direction, depth)
+        point, direction = medium_of(lens).onto_plane((*entered[:2], torch.zeros_like(depth)), direction, depth)
         there, inside, entered = (np.stack([c.numpy().reshape(z.shape) for c in v]) for v in (point[:2], direction, entered[:2]))
         return there, inside, entered, state.power.numpy().reshape(z.shape)
 
-    small, middle = 1e-3 * min(pupil.half_size), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    start = arrive(small * middle, np.full(3, float(z.mean())))[0]
-    grown = np.array([start[0, 1] - start[0, 0], start[1, 2] - start[1, 0]]) / small
-    if not (np.abs(grown) > LEAST_GROWTH).all():
-        raise InputError(
-            "⟨element.radius⟩: the lenses before the lens focus their light inside it; transport needs an extended beam on its exit"
-        )
+    def growth(self, mean: float) -> np.ndarray:
+        """Magnification along x and y from the pupil to a mean height, near the axis.
 
-    def aimed(goal: np.ndarray, z: np.ndarray) -> np.ndarray:
+        Raises:
+            InputError: the light is focused there.
+        """
+        small = 1e-3 * min(self.scene.pupil.half_size)
+        start = self.arrive(small * BESIDE, np.full(3, mean))[0]
+        grown = np.array([start[0, 1] - start[0, 0], start[1, 2] - start[1, 0]]) / small
+        if not (np.abs(grown) > LEAST_GROWTH).all():
+            raise InputError(
+                "⟨element.radius⟩: the lenses before the lens focus their light inside it; transport needs an extended beam on its"
+                " exit"
+            )
+        return grown
+
+    def aimed(self, goal: np.ndarray, z: np.ndarray, grown: np.ndarray) -> np.ndarray:
         """Of rays that arrive at points (2, N) of heights z, (9, N): whether they were found, where they cross the pupil, their
-        directions in the glass, their points on the entrance, and their transmittance."""
+        directions in the glass, their points on the entrance, and their transmittance.  grown: see `growth`."""
         at, left = goal / grown[:, None], np.arange(z.size)
         for _ in range(TRACED_STEPS):  # of the corners not converged; those that no ray reaches remain
-            near = at[:, None, left] + _STEP * middle[:, :, None]
-            here, by_a, by_b = np.moveaxis(arrive(near, np.stack([z[left]] * 3))[0], 1, 0)
+            near = at[:, None, left] + _STEP * BESIDE[:, :, None]
+            here, by_a, by_b = np.moveaxis(self.arrive(near, np.stack([z[left]] * 3))[0], 1, 0)
             ja, jb, off = (by_a - here) / _STEP, (by_b - here) / _STEP, goal[:, left] - here
             with np.errstate(divide="ignore", invalid="ignore"):
                 area = ja[0] * jb[1] - ja[1] * jb[0]
                 move = np.stack([jb[1] * off[0] - jb[0] * off[1], ja[0] * off[1] - ja[1] * off[0]]) / area
             finite = np.isfinite(move).all(0)
             at[:, left] += np.where(finite, move, 0.0)
-            left = left[~finite | (np.abs(off).max(0) > FOUND * max(lens.half_size))]
+            left = left[~finite | (np.abs(off).max(0) > FOUND * max(self.scene.lens.half_size))]
             if not len(left):
                 break
         known = np.ones(z.size, dtype=bool)
         known[left] = False
-        _, d, entered, part = arrive(at, z)
-        part = part * (entering(stopped, at).power.numpy() > 0.0)  # by the apertures of all lenses
+        _, d, entered, part = self.arrive(at, z)
+        part = part * (self.entering(self.systems[1], at).power.numpy() > 0.0)  # by the apertures of all lenses
         return np.concatenate([known[None], at, d, entered, part[None]])
 
-    shape, flat = z.shape, z.ravel()
+
+def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
+    """`incident` over the whole rectangle, traced through the lenses before the lens and in its medium."""
+    pupil, lens, way = scene.pupil, scene.lens, _WayToExit(scene)
+    shape, flat, grown = z.shape, z.ravel(), way.growth(float(z.mean()))
     goal = np.stack([c.ravel() for c in np.broadcast_arrays(x[:, None], y[None, :])])
-    found = [aimed(goal[:, k : k + CORNERS], flat[k : k + CORNERS]) for k in range(0, z.size, CORNERS)]
+    found = [way.aimed(goal[:, k : k + CORNERS], flat[k : k + CORNERS], grown) for k in range(0, z.size, CORNERS)]
     known, at, d, entered, part = np.split(np.concatenate(found, axis=1).reshape(9, *shape), [1, 3, 6, 8])
     known, part = known[0] > 0.0, part[0]
     ga, gb = (np.gradient(c, x, y) for c in at)
@@ -147,7 +166,7 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     power = power * _pupil_irradiance(scene, *at)
     goal = goal.reshape(2, *shape)
     d = _extrapolated(d, known & (power > 0), goal / np.array(lens.half_size)[:, None, None])
-    n = medium.relative_index((*(torch.from_numpy(c.ravel()) for c in goal), torch.from_numpy(flat - lens.z_in)))
+    n = medium_of(lens).relative_index((*(torch.from_numpy(c.ravel()) for c in goal), torch.from_numpy(flat - lens.z_in)))
     return cell_means(power), tuple((n if isinstance(n, float) else n.numpy().reshape(shape)) * c for c in d)
 
 

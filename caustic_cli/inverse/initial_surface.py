@@ -311,8 +311,22 @@ def first_surface(
         if times > 1:
             grid, z = grid.sharper(found, directions, times)
         return InitialSurface(net_of(*grid.places, z, field))
+    found, grid = _near_surface(scene, target, cells, fixed, began + seconds, few, options)
+    z = found.z
+    if times > 1:
+        grid, z = grid.sharper(found.mapped, found.directions, times)
+        z = z + found.middle - _middle(z)
+    net = net_of(*grid.places, np.maximum(z, grid.floor), field)
+    return InitialSurface(net.clamp_min(grid.floor), found.middle)  # the spline undershoots at a kink
+
+
+def _near_surface(
+    scene: Scene, target: np.ndarray, cells: int, fixed: bool, end: float, few: int, options: dict
+) -> tuple[_TruncatedSurface, _Grid]:
+    """The truncated surface of a near source and its grid, of `cells` cells or so many as the time until `end` permits; options of
+    the last transport."""
     coarse = _Grid.of(scene, target, min(cells, few))
-    found = _best(coarse, lens.offset.thickness, fixed)
+    found = _best(coarse, scene.lens.offset.thickness, fixed)
     within = cells
     for most, passes, exactly in ((round(math.sqrt(few * cells)), PASSES - 1, {}), (cells, 1, options)):
         n, started = min(most, within), time.monotonic()
@@ -322,14 +336,9 @@ def first_surface(
         known = coarse.scaled(found.mapped.transport.potential, fine)
         found = fine.truncated(coarse.scaled(found.z, fine), found.middle, passes, known, **exactly)
         coarse, now = fine, time.monotonic()
-        left = max(0.0, seconds - (now - began))  # the time of a pass is proportional to the number of cells
+        left = max(0.0, end - now)  # the time of a pass is proportional to the number of cells
         within = int(min(cells, n * math.sqrt(left * passes / (now - started))))
-    z = found.z
-    if times > 1:
-        coarse, z = coarse.sharper(found.mapped, found.directions, times)
-        z = z + found.middle - _middle(z)
-    net = net_of(*coarse.places, np.maximum(z, coarse.floor), field)
-    return InitialSurface(net.clamp_min(coarse.floor), found.middle)  # the spline undershoots at a kink
+    return found, coarse
 
 
 def _refinement(cells: int, target: np.ndarray) -> int:

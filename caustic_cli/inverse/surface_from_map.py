@@ -147,15 +147,27 @@ def surface(
         if settled and projection and projection.aligned:
             map_ = solve(source, target, half, target_half, start=map_.potential, **options)
         else:
-            first, shift, start = not shift.any(), shift + off, None
-            if first and rough:
-                some = masses.sites(source, half, FEWER)
-                start = solve_displaced(source, some, half, map_.potential, shift, **{**options, **FEW}, fewer=FEWER).potential
-            known = masses.sites(source, half) if first else map_.solved.sites
-            map_ = solve_displaced(source, known, half, map_.potential, shift, start=start, **options)
+            known = map_.solved.sites if shift.any() else None
+            shift = shift + off
+            map_ = _displaced(masses, known, source, half, map_.potential, shift, rough, options)
         rough = False
         aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
     return MappedSurface(z, *landing, miss, shift, again, map_, time.perf_counter() - began)
+
+
+def _displaced(
+    masses: Pixels, known, source, half, potential: np.ndarray, shift: np.ndarray, rough: bool, options: dict
+) -> Transport:
+    """The map onto the masses of the picture displaced by -shift, where a map of this potential sends them.
+
+    known: their sites, if they have been displaced before; rough: find a map of few of them first.
+    """
+    start = None
+    if known is None and rough:
+        some = masses.sites(source, half, FEWER)
+        start = solve_displaced(source, some, half, potential, shift, **{**options, **FEW}, fewer=FEWER).potential
+    known = masses.sites(source, half) if known is None else known
+    return solve_displaced(source, known, half, potential, shift, start=start, **options)
 
 
 def _at_corners(source) -> np.ndarray:
