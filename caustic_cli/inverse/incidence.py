@@ -102,14 +102,14 @@ class _WayToExit:
         return trace_through(system, (at[0] - back * d[0], at[1] - back * d[1], pupil.z - back * d[2]), d)
 
     def arrive(self, at: np.ndarray, z: np.ndarray):
-        """Intersections with the heights z of rays from points (2, N) of the pupil, their directions in the glass, their points on
-        the entrance, and their transmittance."""
+        """Intersections with the heights z of rays from points (2, N) of the pupil, their directions in the glass, and their
+        transmittance."""
         lens, state = self.scene.lens, self.entering(self.systems[0], at)
         entered, direction = (tuple(c.double() for c in state.full(v)) for v in (state.origin, state.direction))
         depth = torch.from_numpy(z.ravel() - lens.z_in)
         point, direction = medium_of(lens).onto_plane((*entered[:2], torch.zeros_like(depth)), direction, depth)
-        there, inside, entered = (np.stack([c.numpy().reshape(z.shape) for c in v]) for v in (point[:2], direction, entered[:2]))
-        return there, inside, entered, state.power.numpy().reshape(z.shape)
+        there, inside = (np.stack([c.numpy().reshape(z.shape) for c in v]) for v in (point[:2], direction))
+        return there, inside, state.power.numpy().reshape(z.shape)
 
     def growth(self, mean: float) -> np.ndarray:
         """Magnification along x and y from the pupil to a mean height, near the axis.
@@ -128,8 +128,8 @@ class _WayToExit:
         return grown
 
     def aimed(self, goal: np.ndarray, z: np.ndarray, grown: np.ndarray) -> np.ndarray:
-        """Of rays that arrive at points (2, N) of heights z, (9, N): whether they were found, where they cross the pupil, their
-        directions in the glass, their points on the entrance, and their transmittance.  grown: see `growth`."""
+        """Of rays that arrive at points (2, N) of heights z, (7, N): whether they were found, where they cross the pupil, their
+        directions in the glass, and their transmittance, 0 where an aperture stops them.  grown: see `growth`."""
         at, left = goal / grown[:, None], np.arange(z.size)
         for _ in range(TRACED_STEPS):  # of the corners not converged; those that no ray reaches remain
             near = at[:, None, left] + _STEP * BESIDE[:, :, None]
@@ -145,9 +145,9 @@ class _WayToExit:
                 break
         known = np.ones(z.size, dtype=bool)
         known[left] = False
-        _, d, entered, part = self.arrive(at, z)
-        part = part * (self.entering(self.systems[1], at).power.numpy() > 0.0)  # by the apertures of all lenses
-        return np.concatenate([known[None], at, d, entered, part[None]])
+        _, d, part = self.arrive(at, z)
+        part = part * (self.entering(self.systems[1], at).power.numpy() > 0.0)
+        return np.concatenate([known[None], at, d, part[None]])
 
 
 def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
@@ -156,13 +156,12 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     shape, flat, grown = z.shape, z.ravel(), way.growth(float(z.mean()))
     goal = np.stack([c.ravel() for c in np.broadcast_arrays(x[:, None], y[None, :])])
     found = [way.aimed(goal[:, k : k + CORNERS], flat[k : k + CORNERS], grown) for k in range(0, z.size, CORNERS)]
-    known, at, d, entered, part = np.split(np.concatenate(found, axis=1).reshape(9, *shape), [1, 3, 6, 8])
+    known, at, d, part = np.split(np.concatenate(found, axis=1).reshape(7, *shape), [1, 3, 6])
     known, part = known[0] > 0.0, part[0]
     ga, gb = (np.gradient(c, x, y) for c in at)
     power = part * np.abs(ga[0] * gb[1] - ga[1] * gb[0])
-    for where, aperture in ((at, pupil.aperture), (entered, lens.opening)):
-        inside = np.all([far / r <= 1 + 1e-9 for far, r in aperture.distances(*where)], axis=0)
-        power = np.where(known & inside, power, 0.0)
+    inside = np.all([far / r <= 1 + 1e-9 for far, r in pupil.aperture.distances(*at)], axis=0)
+    power = np.where(known & inside, power, 0.0)
     power = power * _pupil_irradiance(scene, *at)
     goal = goal.reshape(2, *shape)
     d = _extrapolated(d, known & (power > 0), goal / np.array(lens.half_size)[:, None, None])

@@ -257,18 +257,7 @@ def solve(
 
 
 def solve_displaced(
-    source,
-    sites: _Sites,
-    source_half,
-    potential,
-    shift,
-    *,
-    smooth=1.5,
-    tolerance=5e-3,
-    most=10,
-    darkest=DARKEST,
-    start=None,
-    fewer=1,
+    source, sites, source_half, potential, shift, *, smooth=1.5, tolerance=5e-3, most=10, darkest=DARKEST, start=None, fewer=1
 ) -> Transport:
     """The same onto scattered point masses, each displaced from its own place by -shift at the point of the source that a similar
     map sends to it.
