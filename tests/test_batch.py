@@ -19,6 +19,7 @@ from caustic_cli.kinds import OneSurface
 from caustic_cli.project import checkpoint
 from caustic_cli.studies.radius import cost_of_radius
 from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import preparation, progress
 
 DESIGN = [
     "design",
@@ -302,12 +303,12 @@ def test_make_takes_a_bare_picture_and_tabulates_a_batch():
 
 def test_an_interruption_before_the_first_checkpoint_says_what_is_kept(capfd, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(workflow, "first_heights", interrupt)
+        patch.setattr(preparation, "first_heights", interrupt)
         said = run([*DESIGN, "--quiet"], capfd, 130).err
     assert said == "caustic: interrupted; before the first checkpoint: nothing was written to blob.caustic\n"
     assert not Path("blob.caustic").exists()
     with monkeypatch.context() as patch:
-        patch.setattr(workflow._Records, "keep", interrupt)
+        patch.setattr(progress.Records, "keep", interrupt)
         said = run([*DESIGN, "--quiet"], capfd, 130).err
     assert "blob.caustic holds the settings and the picture" in said and "design --resume blob.caustic" in said
     assert json.loads(run(["design", "--resume", "blob.caustic", "--json", "--quiet"], capfd).out)["iterations"] == 3

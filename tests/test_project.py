@@ -23,6 +23,7 @@ from caustic_cli.project import checkpoint, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import MADE, Project, beside
 from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import preparation
 
 CONFIG = """
 [lens]
@@ -44,7 +45,7 @@ def designed(tmp_path_factory):
     x = np.arange(20)
     np.save(folder / "blob.npy", np.exp(-((x[:, None] - 6) ** 2 + (x - 12) ** 2) / 20.0) + 0.1)
     (folder / "c.toml").write_text(CONFIG)
-    begun = workflow.prepare(
+    begun = preparation.prepare(
         folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=ConsoleReporter(quiet=True)
     )
     workflow.design(begun, "cpu", ConsoleReporter(quiet=True), Start.now())

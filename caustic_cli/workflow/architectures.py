@@ -20,7 +20,7 @@ from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.scene.traits import Capability
 from caustic_cli.workflow.comparison import picture_of_disc
-from caustic_cli.workflow.design import first_heights
+from caustic_cli.workflow.preparation import first_heights
 
 ONE_SIDE = "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
 NETWORKS = Capability("study of networks", dict.fromkeys(("two sides", "lenslet array"), ONE_SIDE))

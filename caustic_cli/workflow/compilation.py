@@ -26,6 +26,7 @@ from caustic_cli.workflow.reporter import Reporter
 
 #: Seconds of compilation before the user is told.
 PATIENCE = 2.0
+COMPILING = "compiling the kernels for this machine, once: about ten seconds"
 
 
 def choose_device(asked: str, say: Reporter) -> str:
@@ -59,7 +60,7 @@ class _Compiled(event.Listener):
 
 
 @contextmanager
-def announce_compilation(say: Reporter, text: str) -> Iterator[None]:
+def announce_compilation(say: Reporter, text: str = COMPILING) -> Iterator[None]:
     """Report `text` if the block compiles kernels for more than `PATIENCE` seconds."""
     with event.install_listener("numba:compile", _Compiled(say, text)):
         yield
@@ -70,7 +71,7 @@ def compile_usual(device: str, say: Reporter, gradient: bool = True) -> None:
     if not backend_for(device).compiled:
         return
     compile_behind(["image"])
-    with announce_compilation(say, "compiling the kernels for this machine, once: about ten seconds"):
+    with announce_compilation(say):
         for part in ("surface", "adjoint", "image") if gradient else ("surface", "image"):
             compile_part(part)
 

@@ -34,9 +34,9 @@ from caustic_cli.studies.photograph import comparison
 from caustic_cli.studies.photograph.model import Guess, deviation, scaled
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.workflow import photographs
-from caustic_cli.workflow.design import provenance
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.photographs import Judged
+from caustic_cli.workflow.progress import provenance
 from caustic_cli.workflow.reporter import Reporter
 
 #: Draws from the posterior; rays per pixel of each of the two images by which one is judged, and least and most of them.

@@ -75,7 +75,7 @@ class Lens:
     origin: Project | ArchivedLens
     #: Of the design.
     state: State | None = None
-    #: Of that, see `workflow.design.provenance`.
+    #: Of that, see `workflow.progress.provenance`.
     provenance: dict[str, Any] | None = None
 
     def surface(self, x: Any, y: Any, side: str = "exit") -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -38,7 +38,7 @@ from caustic_cli.optics.trace import tracers
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow import lamp, lens
+from caustic_cli.workflow import lamp, lens, preparation, progress
 from caustic_cli.workflow.finishing import of_design
 from caustic_cli.workflow.lamp import LampDesign
 from caustic_cli.workflow.lens import Lens, Render, count
@@ -158,7 +158,7 @@ def design_of(
     qualities = [None] if error is None else estimate.cheapest(read, given, error, say, **how)
     for quality in qualities:
         wanted, recording = given if quality is None else {**given, "quality": quality}, recorder(movie, force)
-        prepared = workflow.prepare(read, wanted, **how, out=out, force=force, say=say, device=device)
+        prepared = preparation.prepare(read, wanted, **how, out=out, force=force, say=say, device=device)
         done = workflow.design(prepared, device, say, began, recording, error or 0.0)
         if error is None or estimate.reached(done.figures, error, quality, say):
             break
@@ -215,7 +215,7 @@ def load(path: str | Path, at: str | None = None, **given: Any) -> Lens | LampDe
 
 
 def _lens(done: workflow.Result, device: str, say: Reporter) -> Lens:
-    made = workflow.provenance(done.project, device)
+    made = progress.provenance(done.project, device)
     lens = Lens(done.scene, done.field, done.heights, done.target, done.figures, done.project, done.state, made)
     lens.figures.update(of_design(lens, say))
     return lens

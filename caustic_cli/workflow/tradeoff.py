@@ -20,7 +20,7 @@ from caustic_cli.project.project import Project
 from caustic_cli.studies.beam import beam_figures
 from caustic_cli.studies.efficiency import DesignedLens
 from caustic_cli.workflow.comparison import picture_of_disc
-from caustic_cli.workflow.design import PreparedDesign, first_heights
+from caustic_cli.workflow.preparation import PreparedDesign, first_heights
 
 #: Weights of the loss "light" relative to "rms", for distant sources, where thickness has no influence, and for near sources.
 DISTANT_WEIGHTS, NEAR_WEIGHTS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0), (0.0, 1.0, 10.0)

@@ -15,6 +15,7 @@ from caustic_cli.project import directory
 from caustic_cli.studies import report
 from caustic_cli.studies.report import Study
 from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import progress
 
 DESIGN = ["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset", "--iterations", "1"]
 
@@ -52,7 +53,7 @@ def killed(*_):
 @pytest.mark.parametrize("at", ["first stage", "first checkpoint", "index"])
 def test_a_design_killed_before_its_first_checkpoint_is_begun_anew(at, capfd, monkeypatch):
     """By the same command, as if nothing had been there; another command, or an edit, still finds a design in its way."""
-    where, name = (workflow, "_run") if at == "first stage" else (workflow._Records, "keep")
+    where, name = (workflow, "_run") if at == "first stage" else (progress.Records, "keep")
     options = ["--quiet", "--threads", "1", *(["--gradient", "free", "--index-control", "8"] if at == "index" else [])]
     command = [*(a for a in DESIGN if at != "index" or a not in ("--start", "offset")), *options]
     shutil.rmtree("blob.caustic")

@@ -1,0 +1,199 @@
+"""A design before its first iteration: its project, its problem and its initial heights, after everything that the user gave has
+been checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from caustic_cli.config.settings import Given, build_lens
+from caustic_cli.errors import InputError, at_most
+from caustic_cli.inverse.designer import Designer, InitialHeights
+from caustic_cli.inverse.reachability import largest_magnification
+from caustic_cli.inverse.surface_from_map import OutOfReach
+from caustic_cli.io.files import Piped
+from caustic_cli.io.picture import Picture
+from caustic_cli.kinds import OneSurface, problem_of
+from caustic_cli.kinds.surface import PLATE, WALL
+from caustic_cli.loading import OnDemand
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.project import directory, uptodate
+from caustic_cli.project.completion import shape_words
+from caustic_cli.project.new import new_project
+from caustic_cli.project.project import Project, is_project
+from caustic_cli.scene import Scene
+from caustic_cli.schema.table import TABLE, LensSettings
+from caustic_cli.workflow.compilation import announce_compilation, compile_design
+from caustic_cli.workflow.reporter import Reporter
+
+surfaces = OnDemand("caustic_cli.io.surfaces")
+
+#: Most of a time limit for the initial surface.
+START_PART = 0.3
+
+
+class PreparedDesign(NamedTuple):
+    """A design about to be run: its project, its problem, None where it exists already, and its initial heights, None for the
+    offset surface."""
+
+    project: Project
+    problem: OneSurface | None = None
+    first: InitialHeights | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the design."""
+        return self.project.scene() if self.problem is None else self.problem.scene
+
+
+def prepare(
+    target: Path | Piped | Picture,
+    given: Mapping[str, Any],
+    *,
+    preset: str | None = None,
+    config: Path | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    say: Reporter,
+    device: str = "cpu",
+) -> PreparedDesign:
+    """Validate all input, then create the project directory, if any.
+
+    If the same design exists already, finished or not, its project is opened instead (`Project.checkpoint`).
+
+    Args:
+        given: path in `schema.table` -> value, including derived parameters such as "mag".
+        preset: a name of `config.presets`, whose settings are overridden by those of config.
+        config: a TOML file of further settings, which are overridden by those `given`.
+        out: the directory; None for a design in memory.
+        force: replace a project there.
+        device: of the design, whose kernels are compiled after the validation.
+
+    Raises:
+        InputError: invalid input; nothing was written.
+    """
+    project, said = new_project(target, given, preset, config, out, say.say)
+    if out is not None and not force:
+        if same := uptodate.same_design(out, project.asked):
+            return PreparedDesign(replace(same[0], checkpoint=same[1]))
+        force = uptodate.is_begun(out, project.asked)  # and interrupted before the first checkpoint: it is begun anew
+    problem = problem_of(project, device)  # builds and thereby validates scene, target, stages, options
+    problem.refuse_obstructed()
+    if out is not None:
+        directory.check(out, force)  # before the transport, which may take a minute
+    problem.refuse_unreachable()
+    if words := shape_words(project.settings):
+        say.say(words)
+    compile_design(problem.stages, device)
+    with (
+        announce_compilation(say),
+        say.notify_if_slow("solving the transport of the light to the picture"),
+    ):
+        try:
+            prepared = first_heights(project, said, problem)
+        except OutOfReach as error:
+            most = largest_magnification(problem.scene, project.settings.target.size)
+            most = min(most or 0.0, TABLE["mag"].high)
+            within = f"; ⟨+mag⟩ of at most about {at_most(most, 2)} is within reach at this throw" if most else ""
+            raise InputError(f"{error}{within}") from error
+    if out is not None:
+        directory.create(prepared.project, force)
+    return prepared
+
+
+def first_heights(project: Project, said: Given, problem: OneSurface) -> PreparedDesign:
+    """The initial heights of a design; and its project and problem with thickness and height range adapted to them, except for
+    values `said` by the user.
+
+    Raises:
+        InputError: as of `prepare`.
+    """
+    fixed = "thickness" in said.get("lens", {})
+    plate = problem.adapts and not fixed and _is_plate(project.settings.lens)
+    first, middle = solved(project, problem, fixed, rough=plate)  # of a plate the surface is solved again, for its thickness
+    if not problem.adapts:
+        return PreparedDesign(project, problem, Designer(problem).initial_heights(first))
+    if plate and first is not None:
+        thickness = project.settings.lens.thickness if middle is None else middle
+        if (spare := _spare(project.settings.lens, said, first)) > 0:
+            project, problem = _with_lens(project, problem, thickness=thickness - spare)
+        first, middle = solved(project, problem, fixed=spare > 0)
+        middle = thickness - spare if spare > 0 else middle
+    if middle is not None:
+        project, problem = _with_lens(project, problem, thickness=middle)
+    if first is not None and (room := _room(project.settings.lens, said, first)):
+        project, problem = _with_lens(project, problem, **room)
+        if middle is None:
+            first, _ = solved(project, problem, fixed)
+    return PreparedDesign(project, problem, Designer(problem).initial_heights(first))
+
+
+def solved(project: Project, problem: OneSurface, fixed: bool, rough: bool = False) -> tuple[torch.Tensor | None, float | None]:
+    """Initial heights on the control net of the first stage, by transport or from another lens, None for the offset surface as it
+    is; and the thickness that belongs to them, None if unchanged.
+
+    fixed: the thickness is given by the user; a transport surface below the least thickness is raised, which leaves slopes
+    unchanged; rough: by few cells, for its depth alone.
+
+    Raises:
+        InputError: the project or surface cannot be read, its lens has another size, or the picture cannot be reached.
+    """
+    start = project.settings.design.start
+    if start == "offset":
+        return problem.offset(), None
+    if start == "transport":
+        surface = problem.transport(fixed, START_PART * project.settings.design.time_limit, rough)
+        return surface.heights, surface.middle
+    net = problem.field(0)
+    if Path(start).suffix.lower() in surfaces.SUFFIXES and not Path(start).is_dir():
+        return surfaces.onto(*surfaces.read_surface(start, net.half_size), net), None
+    if not is_project(Path(start)):
+        raise InputError(
+            "⟨design.start⟩ must be transport, offset, a project directory or a lens surface"
+            f" ({', '.join(surfaces.SUFFIXES)}), got {start!r}"
+        )
+    other = Project.open(start)
+    _, field, heights, _ = other.lens(other.scene())
+    sizes = [list(one.settings.lens.size) for one in (other, project)]
+    if sizes[0] != sizes[1]:
+        raise InputError(f"⟨design.start⟩: the lens of {start} is {sizes[0]} mm, not {sizes[1]} mm")
+    return surfaces.onto(field, heights, net), None
+
+
+def _with_lens(project: Project, problem: OneSurface, **values: Any) -> tuple[Project, OneSurface]:
+    """The project with other settings of its lens, and its problem."""
+    full = project.settings
+    project = replace(project, settings=full.changed(lens=full.lens.changed(**values)))
+    return project, problem_of(project, problem.device)
+
+
+def _is_plate(lens: LensSettings) -> bool:
+    """Whether the thickness follows from the depth of the surface and a wall behind it."""
+    return not lens.mirror and max(lens.size) > PLATE
+
+
+def _spare(lens: LensSettings, said: Given, first: torch.Tensor) -> float:
+    """Excess thickness of a plate below its initial surface beyond the wall, which may be given, mm."""
+    wall = lens.min_thickness if "min_thickness" in said.get("lens", {}) else WALL
+    return max(0.0, float(first.min()) - lens.z_in - wall)
+
+
+def _room(given: LensSettings, said: Given, first: torch.Tensor) -> dict[str, Any]:
+    """Height range and thickness as the initial surface requires, where it needs others and the user fixed none."""
+    lens = build_lens(given)
+    offset = HeightField.of(replace(lens, control=tuple(first.shape)))
+    x, y = (c.numpy() for c in offset.control_xy())
+    base = lens.offset.heights(x, y)
+    departure = 2.0 * float(np.abs(first.numpy() - base).max())
+    short = lens.floor - float(first.min())
+    fixed, changed = said.get("lens", {}), dict[str, Any]()
+    if departure > lens.height_range[1] and "height_range" not in fixed:
+        changed["height_range"] = (-departure, departure)
+    if short > 0 and "thickness" not in fixed:
+        changed["thickness"] = given.thickness + (1.5 * short + 0.02 * max(lens.size))
+    return changed

@@ -1,0 +1,153 @@
+"""What happens during the iterations of a design: progress, the curve of its error, checkpoints, and interruption."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from caustic_cli import __version__
+from caustic_cli.errors import CausticError
+from caustic_cli.inverse.accuracy_cost import CostOfAccuracy, Start
+from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.target import grey
+from caustic_cli.project import uptodate
+from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.project import CHECKPOINT, Project
+from caustic_cli.workflow.movie import NoMovie
+from caustic_cli.workflow.reporter import Reporter
+
+#: Time of a checkpoint, s, beyond which the interval to the next one grows, and the factor of the excess.
+QUICK, RARELY = 0.5, 10.0
+
+
+class Watch:
+    """Called after every iteration of a design: progress, movie and checkpoints."""
+
+    def __init__(
+        self, project: Project, designer: Designer, records: Records, say: Reporter, movie: NoMovie, began: Start, state: State
+    ):
+        self.designer, self.records, self.say, self.movie = designer, records, say, movie
+        self.chosen, self.encoding = project.settings.design, project.settings.target.encoding
+        self.target = designer.problem.target.numpy()
+        lasting = [s for s in designer.stages if not s.spare] or designer.stages
+        self.total = self.chosen.iterations or sum(s.iterations for s in lasting)
+        self.stage, self.saved = -1, time.monotonic()
+        self.now: State | None = None
+        self.show: Callable[..., None] = lambda *progress: None
+        error_of, count = partial(designer.problem.error_of, designer), designer.problem.effort.cost_points
+        self.cost = CostOfAccuracy(began, error_of, self.total, count, state.accuracy)
+
+    def measure(self, now: State, always: bool = False) -> None:
+        """Measure the error of the lens, as `CostOfAccuracy.measure` does."""
+        self.now = now
+        now.accuracy = list(self.cost.measure(now.total, now, always))
+
+    def reaches(self, goal: float) -> bool:
+        """Whether the lens has at most this error, which is measured anew where the loss says that it may."""
+        now = self.now
+        if not goal or now is None or not now.accuracy:
+            return False
+        last, losses = now.accuracy[-1], {0: math.inf} | {row[0]: row[2] for row in now.history}
+        if last.iteration < now.total and last.error * losses[now.total] <= goal * losses[last.iteration]:
+            self.measure(now, always=True)
+        return now.accuracy[-1].iteration == now.total and now.accuracy[-1].error <= goal
+
+    def __call__(self, now: State) -> None:
+        self.now = now
+        stages, stage = self.designer.stages, self.designer.stages[now.stage]
+        name = f"stage {now.stage + 1}/{len(stages)}"
+        if now.stage != self.stage:
+            self.stage = now.stage
+            self.say.say(f"{name}: {stage.control[0]} x {stage.control[1]} control points, {stage.light}")
+        _, _, loss, on_screen, _ = now.history[-1]
+        self.show(name, f"loss {loss * grey(self.target).size:.4f}  on screen {on_screen:.1%}", now.total, self.total)
+        self.movie.record(now, self.target, self.encoding, bool(stage.waves))
+        self.measure_if_due(now)
+        self.keep_if_due(now)
+
+    def measure_if_due(self, now: State) -> None:
+        """Measure the error of the lens if this iteration is one of those planned."""
+        if now.total in self.cost.due:
+            self.measure(now)
+
+    def keep_if_due(self, now: State) -> None:
+        """Write a checkpoint if the last one is old enough."""
+        if time.monotonic() - self.saved >= max(self.chosen.checkpoint_every, RARELY * (self.records.seconds - QUICK)):
+            self.measure(now)
+            self.saved = time.monotonic()  # before writing, which takes time itself
+            self.records.keep(now)
+
+
+class Records:
+    """Writes the checkpoints of a design, if it has a directory."""
+
+    def __init__(self, project: Project, designer: Designer):
+        self.project, self.designer, self.inputs = project, designer, uptodate.inputs(project)
+        self.provenance = provenance(project, designer.problem.device)
+        self._resumes = f"caustic design ⟨resume⟩ {project.path} continues from it"
+        self._before = project.path is not None and (project.path / CHECKPOINT).exists()
+        self._safe = f"the one before is intact, {self._resumes}" if self._before else "nothing of it is on disk"
+        self.seconds = 0.0  # that the last checkpoint took
+
+    def keep(self, now: State, figures: dict[str, Any] | None = None) -> None:
+        """Write a checkpoint, with the figures of a finished design.
+
+        Raises:
+            CausticError: it could not be written; says which checkpoint is intact.
+        """
+        if self.project.path is None:
+            return
+        began = time.monotonic()
+        try:
+            self.project.save(Checkpoint(now, self.designer.field(now.stage).spaces, self.provenance, figures or {}, self.inputs))
+        except CausticError as error:
+            raise CausticError(f"{error} after iteration {now.total}; {self._safe}") from error
+        if not self._before:  # the first checkpoint
+            uptodate.forget_begun(self.project.path)
+            self._before = True
+        self._safe = f"the one of iteration {now.total} is intact, {self._resumes}"
+        self.seconds = time.monotonic() - began
+
+
+def provenance(project: Project, device: str) -> dict[str, Any]:
+    """Provenance of a lens: versions, device, threads, seed and hash of the picture."""
+    return {
+        "caustic": __version__,
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "seed": project.settings.design.seed,
+        "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
+    }
+
+
+@contextmanager
+def signals_collected(collect: bool = True) -> Iterator[list[int]]:
+    """Collect SIGINT and SIGTERM instead of terminating, if asked and in the main thread; a second SIGINT interrupts."""
+    asked: list[int] = []
+    if not collect or threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+
+    def handler(number: int, _frame) -> None:
+        if asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, old in previous.items():
+            signal.signal(number, old)
