@@ -6,7 +6,7 @@ import pytest
 
 from caustic_cli import cli
 from caustic_cli.inverse import accuracy_cost
-from caustic_cli.inverse.accuracy_cost import CostOfAccuracy, Row, Start, iterations_to_measure, price
+from caustic_cli.inverse.accuracy_cost import CostOfAccuracy, Row, Start, iterations_to_measure, price, seconds_to
 
 
 @pytest.mark.parametrize("total", [1, 2, 5, 7, 8, 12, 40, 92, 1000])
@@ -66,7 +66,8 @@ def test_the_price_of_a_smaller_error():
     rows = [Row(0, 2.0, 2.0, 1.0), *(Row(k, 2.0 + t, 2.0, t**-0.5) for k, t in enumerate((1.0, 2.0, 4.0, 8.0), 1))]
     assert "about 1.9 s more" in price(rows)  # 8 (0.9^-2 - 1)
     assert "not lower" in price([row._replace(error=0.3) for row in rows])
-    assert price(rows[:2]) == ""
+    assert price(rows[:2]) == "" and seconds_to(rows[:2], 0.1) is None
+    assert abs(seconds_to(rows, 0.5 * 8**-0.5) - 24.0) < 1e-9 and seconds_to(rows, 1.0) == 0.0  # a fourfold time
 
 
 def test_a_design_keeps_its_curve(tmp_path, capsys):

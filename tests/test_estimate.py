@@ -8,6 +8,7 @@ import pytest
 from helpers import write_blob
 
 from caustic_cli import cli
+from caustic_cli.inverse.accuracy_cost import Aim
 from caustic_cli.kinds import problem_of
 from caustic_cli.project.new import new_project
 from caustic_cli.project.project import Project
@@ -121,14 +122,25 @@ def test_a_design_for_an_error_takes_the_cheapest_and_stops_there(capfd, monkeyp
     assert json.loads(json.dumps(Project.open("blob.caustic").load().results))["error"] == found["error"]
 
 
+def test_a_design_for_an_error_takes_further_iterations_that_should_reach_it(capfd, monkeypatch):
+    few = [*SMALL, "--start", "offset", "--force"]
+    planned = figures_of(capfd, "--quality", "draft", *few)
+    monkeypatch.setattr(estimate, "cheapest", lambda *_, **__: [("draft", Aim(0.9 * planned["error"], 60.0))])
+    found = figures_of(capfd, "--error", "0.1", *few)
+    assert found["iterations"] > planned["iterations"] and found["error"] <= 0.9 * planned["error"] + found["noise"]
+    monkeypatch.setattr(estimate, "cheapest", lambda *_, **__: [("draft", Aim(1e-6, 60.0))])
+    assert figures_of(capfd, "--error", "0.1", *few)["iterations"] == planned["iterations"]
+
+
 def test_a_design_goes_on_and_says_what_no_quality_reaches(monkeypatch):
     fixed = {(by, q): ((np.log(0.01), 0.0, 0.0, 0.0, 0.0), 0.1) for by in ("rays", "waves") for q in estimate.QUALITIES}
     monkeypatch.setattr(estimate, "ERRORS", fixed)
     said: list[str] = []
-    qualities = estimate.cheapest(Path("blob.png"), {"screen.resolution": (24, 24)}, 0.02, Listener(on_message=said.append))
-    assert qualities == ["draft", "standard", "fine"] and "draft: an error of 0.01" in said[0]
-    figures = {"error": 0.03, "error_by": "rays", "noise": 0.001}
     say = Listener(on_message=said.append)
+    qualities, aims = zip(*estimate.cheapest(Path("blob.png"), {"screen.resolution": (24, 24)}, 0.02, say), strict=True)
+    assert qualities == ("draft", "standard", "fine") and "draft: an error of 0.01" in said[0]
+    assert {aim.error for aim in aims} == {0.02} and aims[0].seconds <= aims[1].seconds == aims[2].seconds
+    figures = {"error": 0.03, "error_by": "rays", "noise": 0.001}
     assert not estimate.reached(figures, 0.02, "draft", say) and not said[-1].endswith("no quality reaches it")
     assert not estimate.reached(figures, 0.02, "fine", say) and said[-1].endswith("no quality reaches it")
     assert estimate.reached(figures, 0.0295, "fine", say)

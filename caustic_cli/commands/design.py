@@ -77,7 +77,8 @@ class DesignOptions(options.Computation):
         typer.Option(
             metavar="E",
             help="Take the cheapest quality that should reach this relative RMS error, judged by light that the optimiser does not"
-            " use; stop as soon as it does; go on with the next quality if it does not.",
+            " use; stop as soon as it does; if it does not, go on with further iterations that should reach it, or with the next"
+            " quality.",
             show_default=False,
         ),
     ] = None

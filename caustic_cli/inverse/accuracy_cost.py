@@ -88,22 +88,38 @@ class CostOfAccuracy:
         return self.rows
 
 
-def price(rows: Sequence[Row]) -> str:
-    """What a smaller error would cost, in one sentence, extrapolated from the last rows: a power of the time from the initial lens;
-    "" for fewer than three rows."""
+class Aim(NamedTuple):
+    """An independent error at which a design ends; and seconds that further iterations of its last stage may take to reach it."""
+
+    error: float
+    seconds: float
+
+
+def seconds_to(rows: Sequence[Row], error: float) -> float | None:
+    """Further seconds until an error is reached, extrapolated from the last rows: a power of the time from the initial lens;
+    infinite where it no longer decreases, None for fewer than three rows."""
     if len(rows) < 3:
-        return ""
-    last, first = rows[-1], rows[0]
+        return None
+    first = rows[0]
     latest = [row for row in rows[-LATEST:] if row.seconds > first.seconds]
     spent = np.array([row.seconds - first.seconds for row in latest])
     errors = np.array([row.error for row in latest])
     if len(latest) < 2 or not (errors > 0).all():
-        return ""
+        return None
     exponent = -float(np.polyfit(np.log(spent), np.log(errors), 1)[0])
     if exponent < FLAT:
-        return f"Further iterations of these stages would not lower the error of {last.error:.3g}."
-    more = spent[-1] * math.expm1(-math.log1p(-LESS) / exponent)
-    return f"The next {LESS:.0%} of the error of {last.error:.3g} would cost about {more:.2g} s more in these stages."
+        return math.inf
+    return float(spent[-1]) * math.expm1(max(0.0, math.log(errors[-1] / error)) / exponent)
+
+
+def price(rows: Sequence[Row]) -> str:
+    """What a smaller error would cost, see `seconds_to`, in one sentence; "" for fewer than three rows."""
+    more = seconds_to(rows, (1.0 - LESS) * rows[-1].error) if rows else None
+    if more is None:
+        return ""
+    if math.isinf(more):
+        return f"Further iterations of these stages would not lower the error of {rows[-1].error:.3g}."
+    return f"The next {LESS:.0%} of the error of {rows[-1].error:.3g} would cost about {more:.2g} s more in these stages."
 
 
 def as_table(rows: Iterable[Row]) -> list[dict[str, Any]]:

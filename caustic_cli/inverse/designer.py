@@ -152,6 +152,7 @@ class Designer:
         iterations: int = 0,
         time_limit: float = math.inf,
         stop: Callable[[], bool] = lambda: False,
+        further: Callable[[], bool] = lambda: False,
         on_iteration: Callable[[State], None] = lambda s: None,
         on_objective: Callable[[State], None] = lambda s: None,
         notice: Callable[[str], None] = lambda text: None,
@@ -162,6 +163,7 @@ class Designer:
             iterations: in total, counted from the beginning of the design; 0 for those of the stages.
             time_limit: seconds for this run, shared by the stages in proportion to their cost.
             stop: called after every iteration; True ends the run with a complete state.
+            further: called after the last iteration and every one beyond it; True continues.
             on_iteration: called after every iteration.
             on_objective: called when the objective of a stage is ready, before its iterations.
             notice: called with messages for the user, such as of a rejected step.
@@ -180,7 +182,7 @@ class Designer:
             if k < last and ahead and math.isfinite(time_limit):
                 deadline = started + time_limit * sum(s.cost for j, s in used.items() if first <= j <= k) / ahead
             limit = iterations or sum(s.iterations for s in used.values())
-            end = partial(self._end, state, k, limit, deadline, stop)
+            end = partial(self._end, state, k, limit, deadline, stop, further)
             try:
                 done = self._stage(state, k, end, on_iteration, on_objective, notice)
             except Skipped as skipped:
@@ -206,7 +208,9 @@ class Designer:
         """
         return self.problem.feasible(state.stage, state.heights)
 
-    def _end(self, state: State, k: int, limit: int, deadline: float, stop: Callable[[], bool]) -> bool | None:
+    def _end(
+        self, state: State, k: int, limit: int, deadline: float, stop: Callable[[], bool], further: Callable[[], bool]
+    ) -> bool | None:
         """Whether stage k is done (True), the whole design ends here for `state.reason` (False), or neither (None); decided from
         the contents of a checkpoint alone but for time and signals, so that a resumed run decides alike."""
         stage, final = self.stages[k], k == len(self.stages) - 1
@@ -216,7 +220,7 @@ class Designer:
             state.reason = "no progress"
             return True
         asked, late = (ranks.decide(said, self.problem.device) for said in (stop(), time.monotonic() >= deadline))
-        if state.total >= limit or asked:
+        if asked or (state.total >= limit and not ranks.decide(further(), self.problem.device)):
             state.reason = "interrupted" if asked else "iterations"
             return False
         if late and (state.iteration > 0 or final):

@@ -13,7 +13,7 @@ import torch
 from caustic_cli.config import settings
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import Interrupted
-from caustic_cli.inverse.accuracy_cost import Start, as_table
+from caustic_cli.inverse.accuracy_cost import Aim, Start, as_table
 from caustic_cli.inverse.designer import Designer, InitialHeights, State
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.picture import Picture
@@ -65,32 +65,32 @@ class Result:
 
 
 def design(
-    prepared: PreparedDesign, device: str, say: Reporter, began: Start, movie: NoMovie = NO_MOVIE, goal: float = 0.0
+    prepared: PreparedDesign, device: str, say: Reporter, began: Start, movie: NoMovie = NO_MOVIE, aim: Aim | None = None
 ) -> Result:
-    """Run a new design from its initial heights to its end; movie: records it; goal: independent error at which it ends.
+    """Run a new design from its initial heights to its end; movie: records it; aim: an error at which it ends.
 
     A finished design found by `prepare` is returned; an unfinished one is continued.
     """
     project, problem, first = prepared
     if problem is None:
-        return _again(project, device, say, began, movie, goal)
+        return _again(project, device, say, began, movie, aim)
     with project.hold:
         _compile(problem, say)
         state = Designer(problem).initial_state(*first or ())
         if problem.in_stages:
             _say_limits(project, problem, first, say)
-        return _run(project, problem, state, say, began, None, movie, goal)
+        return _run(project, problem, state, say, began, None, movie, aim)
 
 
-def _again(project: Project, device: str, say: Reporter, began: Start, movie: NoMovie, goal: float) -> Result:
+def _again(project: Project, device: str, say: Reporter, began: Start, movie: NoMovie, aim: Aim | None) -> Result:
     """The result of a design found by `prepare`."""
     figures = uptodate.finished(project, project.checkpoint)
-    if figures and figures["reason"].startswith(REACHED) and not figures["error"] <= goal:
+    if figures and figures["reason"].startswith(REACHED) and not (aim and figures["error"] <= aim.error):
         figures = {}  # it ended for a larger error
     rest = "there is nothing to do; ⟨force⟩ designs it anew" if figures else "it continues from its checkpoint"
     say.say(f"{project.path}: was designed from the same picture with the same options, so {rest}")
     if not figures:
-        return resume(project, None, None, device, say, began, movie, goal)
+        return resume(project, None, None, device, say, began, movie, aim)
     movie.unused(say)
     scene = project.scene()
     target = project.target(scene)
@@ -120,7 +120,7 @@ def resume(
     say: Reporter,
     began: Start,
     movie: NoMovie = NO_MOVIE,
-    goal: float = 0.0,
+    aim: Aim | None = None,
 ) -> Result:
     """Continue from the last checkpoint; with nothing left to do, evaluate the lens again."""
     with project.hold:
@@ -143,7 +143,7 @@ def resume(
             project = replace(project, settings=project.settings.changed(design=changed))
             project.write_settings()
         project = replace(project, asked=uptodate.asked_of(project, checkpoint) if has_checkpoint else uptodate.begun(project))
-        return _run(project, problem, state, say, began, time_limit, movie, goal)
+        return _run(project, problem, state, say, began, time_limit, movie, aim)
 
 
 def _compile(problem: OneSurface, say: Reporter) -> None:
@@ -217,7 +217,7 @@ def _run(
     began: Start,
     time_limit: float | None,
     movie: NoMovie = NO_MOVIE,
-    goal: float = 0.0,
+    aim: Aim | None = None,
 ) -> Result:
     if not problem.in_stages:
         return _run_index(project, problem, state, say, began, time_limit, movie)
@@ -238,12 +238,13 @@ def _run(
                 state,
                 iterations=chosen.iterations,
                 time_limit=limit,
-                stop=lambda: bool(asked) or watch.reaches(goal),
+                stop=lambda: bool(asked) or watch.reaches(aim),
+                further=lambda: watch.goes_on(aim),
                 on_iteration=watch,
                 on_objective=watch.measure_if_due,
                 notice=say.say,
             )
-            if not asked and watch.reaches(goal):
+            if not asked and watch.reaches(aim):
                 state.reason = REACHED
             if not asked and not chosen.iterations and problem.options.parametrisation.free and state.reason in DONE:
                 start, sharp = (None if z is None else rounded(z) for z in (state.start, state.unrounded))

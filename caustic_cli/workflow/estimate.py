@@ -29,6 +29,7 @@ from caustic_cli.config.design import region_of
 from caustic_cli.config.settings import build_source
 from caustic_cli.config.wave_stages import transform_samples
 from caustic_cli.errors import CausticError, InputError
+from caustic_cli.inverse.accuracy_cost import Aim
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped, read_bytes, write_bytes
 from caustic_cli.io.picture import Picture
@@ -270,8 +271,10 @@ def cheapest(
     *,
     preset: str | None = None,
     config: Path | None = None,
-) -> list[str]:
+) -> list[tuple[str, Aim]]:
     """The cheapest quality that should reach an error, and those after it; says so where none should.
+
+    If a quality does not reach it, further iterations may take as long as the next one should, of the last as it should itself.
 
     Raises:
         InputError: as of `plans`.
@@ -284,7 +287,8 @@ def cheapest(
     say.say(f"{e.quality}: an error of {e.relative_rms:.2g} by {e.error_by} ({between}) in {e.seconds:.0f} s is expected")
     if e.low > error:
         say.say(f"an error of {error:g} is less than any quality is expected to reach")
-    return list(QUALITIES[first:])
+    longest = [*(e.seconds for e in found[first + 1 :]), found[-1].seconds]
+    return [(e.quality, Aim(error, seconds)) for e, seconds in zip(found[first:], longest, strict=True)]
 
 
 def reached(figures: Mapping[str, Any], error: float, quality: str, say: Reporter) -> bool:

@@ -155,12 +155,12 @@ def design_of(
     if asks_for_lamp(given, preset, config):
         _refuse_for_lamps({"movie": movie, "error": error}, device)
         return lamp.design(read, given, **how, out=out, force=force, say=say)
-    qualities = [None] if error is None else estimate.cheapest(read, given, error, say, **how)
-    for quality in qualities:
+    tries = [(None, None)] if error is None else estimate.cheapest(read, given, error, say, **how)
+    for quality, aim in tries:
         wanted, recording = given if quality is None else {**given, "quality": quality}, recorder(movie, force)
         prepared = preparation.prepare(read, wanted, **how, out=out, force=force, say=say, device=device)
-        done = workflow.design(prepared, device, say, began, recording, error or 0.0)
-        if error is None or estimate.reached(done.figures, error, quality, say):
+        done = workflow.design(prepared, device, say, began, recording, aim)
+        if aim is None or quality is None or estimate.reached(done.figures, aim.error, quality, say):
             break
         force = True  # it replaces the lens that was not good enough
     return _lens(done, device, say)

@@ -17,7 +17,7 @@ import torch
 
 from caustic_cli import __version__
 from caustic_cli.errors import CausticError
-from caustic_cli.inverse.accuracy_cost import CostOfAccuracy, Start
+from caustic_cli.inverse.accuracy_cost import Aim, CostOfAccuracy, Start, seconds_to
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.target import grey
 from caustic_cli.project import uptodate
@@ -28,6 +28,8 @@ from caustic_cli.workflow.reporter import Reporter
 
 #: Time of a checkpoint, s, beyond which the interval to the next one grows, and the factor of the excess.
 QUICK, RARELY = 0.5, 10.0
+#: Time that further iterations get to reach an error, over what is expected.
+LONGER = 2.0
 
 
 class Watch:
@@ -43,6 +45,7 @@ class Watch:
         self.total = self.chosen.iterations or sum(s.iterations for s in lasting)
         self.stage, self.saved = -1, time.monotonic()
         self.now: State | None = None
+        self.until = -math.inf  # when further iterations end
         self.show: Callable[..., None] = lambda *progress: None
         error_of, count = partial(designer.problem.error_of, designer), designer.problem.effort.cost_points
         self.cost = CostOfAccuracy(began, error_of, self.total, count, state.accuracy)
@@ -52,15 +55,27 @@ class Watch:
         self.now = now
         now.accuracy = list(self.cost.measure(now.total, now, always))
 
-    def reaches(self, goal: float) -> bool:
+    def reaches(self, aim: Aim | None) -> bool:
         """Whether the lens has at most this error, which is measured anew where the loss says that it may."""
         now = self.now
-        if not goal or now is None or not now.accuracy:
+        if aim is None or now is None or not now.accuracy:
             return False
         last, losses = now.accuracy[-1], {0: math.inf} | {row[0]: row[2] for row in now.history}
-        if last.iteration < now.total and last.error * losses[now.total] <= goal * losses[last.iteration]:
+        if last.iteration < now.total and last.error * losses[now.total] <= aim.error * losses[last.iteration]:
             self.measure(now, always=True)
-        return now.accuracy[-1].iteration == now.total and now.accuracy[-1].error <= goal
+        return now.accuracy[-1].iteration == now.total and now.accuracy[-1].error <= aim.error
+
+    def goes_on(self, aim: Aim | None) -> bool:
+        """Whether iterations beyond those of the stages should reach an error in the time that they may take."""
+        now = self.now
+        if aim is None or now is None:
+            return False
+        if self.until < 0:
+            self.measure(now, always=True)
+            more = seconds_to(now.accuracy, aim.error)
+            expected = more is not None and more <= aim.seconds
+            self.until = time.monotonic() + min(aim.seconds, LONGER * more) if expected else 0.0
+        return time.monotonic() < self.until
 
     def __call__(self, now: State) -> None:
         self.now = now
