@@ -17,12 +17,12 @@ from caustic_cli.inverse.designer import State
 from caustic_cli.io.colorimetry import D65, XYZ_OF_RGB, mean_color_difference, mixture
 from caustic_cli.io.picture import codes_of, read_picture, write_image
 from caustic_cli.project import colours
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.light import RGB
 from caustic_cli.scene.spectrum import primaries
 from caustic_cli.studies.color_error import color_figures, shown
 from caustic_cli.studies.viewing import as_viewed
-from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow.movie import Movie
 
 LASERS = (638.0, 520.0, 450.0)
@@ -179,7 +179,7 @@ def test_a_design_in_colour(picture, capfd):
     whole, parts = (Path(f"{name}.caustic") for name in ("whole", "parts"))
     for name in ("project.toml", "render.png"):
         assert (whole / name).read_bytes() == (parts / name).read_bytes()
-    assert workflow.Project.open(whole).settings.source.weights == tuple(colours.filled({}, picture)["weights"])
+    assert Project.open(whole).settings.source.weights == tuple(colours.filled({}, picture)["weights"])
 
     def render(*light: str) -> dict:
         return run(capfd, "render", whole, "--rays", "20000", *light, "-o", "out.png", "--force", "--quiet")
@@ -199,12 +199,12 @@ def test_a_project_without_weights_opens(picture, capfd):
     """As written by hand: they follow from the picture, as for other wavelengths from the library."""
     run(capfd, "design", "rgb.png", "--color", *TINY, "--iterations", "1")
     path = Path("rgb.caustic/project.toml")
-    before = workflow.Project.open("rgb.caustic").scene().light
+    before = Project.open("rgb.caustic").scene().light
     other = load("rgb.caustic", wavelengths=list(LASERS)).scene.light
     assert list(other.weights) == colours.filled({"wavelengths": list(LASERS)}, picture)["weights"]
     path.write_text(re.sub(r"(?ms)^weights = \[.*?\][^\n]*\n", "", path.read_text()))
     assert "weights" not in path.read_text()
-    assert workflow.Project.open("rgb.caustic").scene().light == before
+    assert Project.open("rgb.caustic").scene().light == before
 
 
 def test_floating_point_colours_have_their_brightest_as_white(picture, tmp_path):

@@ -22,6 +22,7 @@ from caustic_cli import cli
 from caustic_cli.inverse.designer import State
 from caustic_cli.kinds import evaluation, surface
 from caustic_cli.project import checkpoint
+from caustic_cli.project.project import Project
 from caustic_cli.workflow import design as workflow
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1"]
@@ -322,7 +323,7 @@ def test_the_wall_of_a_plate_is_what_was_said(capfd, said, wall):
 def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeypatch):
     monkeypatch.setattr(workflow, "_run", begun)
     design(capfd, "blob.png", "--resolution", "24", "--waves", "off", "--quiet", "--threads", "1", "--time-limit", limit, "-o", "p")
-    stages = workflow.Project.open("p").settings.design.stages
+    stages = Project.open("p").settings.design.stages
     assert stages[-1].control == (control + 3, control + 3)
     assert stages[-1].rays == rays and len(stages) == {5: 1, 20: 2, 90: 2}[limit]
 
@@ -332,7 +333,7 @@ def test_a_source_with_an_extent_takes_longer(capfd, limit, stages, monkeypatch)
     monkeypatch.setattr(workflow, "_run", begun)
     sun = ("--source-angle", "0.533", "--resolution", "24", "--waves", "off", "--quiet", "--threads", "1")
     design(capfd, "blob.png", *sun, "--time-limit", limit, "-o", "p")
-    assert len(workflow.Project.open("p").settings.design.stages) == stages
+    assert len(Project.open("p").settings.design.stages) == stages
 
 
 def test_lbfgs_never_goes_uphill_within_a_stage(capfd):
@@ -410,7 +411,7 @@ def test_a_time_limit_reaches_the_last_stage(capfd):
     """However short: a lens on a coarse net alone would not be the lens of project.toml."""
     design(capfd, "blob.png", *TINY, *NARROW, "--time-limit", 0.01)
     state = load("blob.caustic").state
-    stages = workflow.Project.open("blob.caustic").settings.design.stages
+    stages = Project.open("blob.caustic").settings.design.stages
     assert state.stage == len(stages) - 1 and tuple(state.heights.shape) == (12, 12)
 
 

@@ -29,10 +29,10 @@ from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.emission.coherent import Mode, modes, outermost_modes
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.studies.independent_rays import sample_rays
-from caustic_cli.workflow import design as workflow
 
 AT = (0.5, -0.5, -12.0)
 COSINE = Distribution(tuple(np.linspace(0, 90, 2001)), tuple(np.cos(np.radians(np.linspace(0, 90, 2001)))))
@@ -371,7 +371,7 @@ def test_designs_keep_their_files(here, capfd, source, kept):
         capfd, "render", "blob.caustic", "--rays", "40000", "--force", "--effects", "entrance,intersection,fresnel,source-size"
     )
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], rel=0.05)
-    assert workflow.Project.open("blob.caustic").settings.source.intensity == (
+    assert Project.open("blob.caustic").settings.source.intensity == (
         next((name for name in kept if name.startswith("intensity")), "lambertian" if "lambertian" in source else "uniform")
     )
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,12 +26,12 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.colours import powers
 from caustic_cli.project.completion import complete
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.light import RGB
 from caustic_cli.scene.spectrum import primaries
 from caustic_cli.studies import effects as study
-from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow.outputs.base import Request
 
 NAMES = tuple(effect.name for effect in EFFECTS)
@@ -127,7 +128,7 @@ def test_a_design_for_a_shifted_screen_hits_it(capfd):
 def test_a_mirror_is_designed_and_exported_as_one(capfd):
     figures = run(capfd, "design", "blob.png", "--mirror", *TINY)
     assert figures["on_screen"] > 0.98 and figures["lost"]["fresnel"] == 0
-    toml = settings.read(workflow.Path("blob.caustic/project.toml"))
+    toml = settings.read(Path("blob.caustic/project.toml"))
     assert toml["lens"]["mirror"] and toml["screen"]["z"] == -90.0
     lens = run(capfd, "design", "blob.png", *TINY, "-o", "lens.caustic")
     assert figures["relative_rms"] < 1.2 * lens["relative_rms"]
@@ -153,7 +154,7 @@ def test_an_archive_keeps_glass_and_light(capfd):
     for source, image in (("blob.caustic", "a.npy"), ("lens.npz", "b.npy")):
         run(capfd, "render", source, "--rays", "4000", "--npy", image)
     assert (np.load("a.npy") == np.load("b.npy")).all()
-    scene, light = open_archive("lens.npz")[0], workflow.Project.open("blob.caustic").scene().light
+    scene, light = open_archive("lens.npz")[0], Project.open("blob.caustic").scene().light
     assert scene.light.fractions == light.fractions and scene.light.wavelengths == light.wavelengths
 
 
@@ -168,7 +169,7 @@ def test_dispersion_of_a_glass_and_its_range(capfd):
 
 def test_a_coloured_target(capfd):
     figures = run(capfd, "design", "rgb.png", "--color", *TINY)
-    project = workflow.Project.open("rgb.caustic")
+    project = Project.open("rgb.caustic")
     assert project.settings.source.wavelengths == tuple(RGB) and project.settings.lens.glass == "N-BK7"
     light = powers(project.picture, project.scene().light).sum((1, 2))  # not R, G, B: what looks like them
     assert project.settings.source.weights == pytest.approx(list(light / light.sum()))
@@ -298,24 +299,24 @@ def test_files_of_one_index_have_that_of_the_one_wavelength(capfd):
         run(capfd, "export", "blob.caustic", "-o", name)
     assert float(np.load("lens.npz")["refractive_index"]) == pytest.approx(1.52532, abs=1e-5)
     for name in ("lens.dat", "lens.xml"):
-        text = workflow.Path(name).read_text()
+        text = Path(name).read_text()
         assert "1.5253" in text and "1.5168" not in text
 
 
 def test_wavelengths_leave_a_coloured_picture_its_balance(capfd):
     run(capfd, "design", "rgb.png", "--color", "--wavelengths", "620,540,460", *TINY, "-o", "own.caustic")
     run(capfd, "design", "rgb.png", "--color", "--wavelengths", "620:1,540:1,460:1", *TINY, "-o", "even.caustic")
-    own, even = (workflow.Project.open(f"{name}.caustic").scene().light for name in ("own", "even"))
+    own, even = (Project.open(f"{name}.caustic").scene().light for name in ("own", "even"))
     red, green, blue = own.fractions
     # R, G, B are 2 : 1 : 2, and these what looks like them; the sums of R, G, B themselves would not
-    mean = XYZ_OF_RGB @ workflow.Project.open("own.caustic").picture.irradiance().mean((1, 2))
+    mean = XYZ_OF_RGB @ Project.open("own.caustic").picture.irradiance().mean((1, 2))
     mixed = primaries((620.0, 540.0, 460.0)) @ (red, green, blue)
     assert mixed / mixed.sum() == pytest.approx(mean / mean.sum(), rel=1e-9) and even.fractions == (1 / 3,) * 3
 
 
 def test_a_configuration_says_how_the_picture_is_read(capfd):
     np.save("rgb.npy", np.random.default_rng(0).random((3, 24, 24)))
-    workflow.Path("c.toml").write_text("[target]\ncolor = true\n")
+    Path("c.toml").write_text("[target]\ncolor = true\n")
     assert len(run(capfd, "design", "rgb.npy", "--config", "c.toml", *TINY)["lost"]) > 0
 
 
@@ -338,16 +339,16 @@ def test_an_image_for_another_value_is_another(tmp_path):
 
 
 def test_what_a_project_is_made_of_is_no_output():
-    workflow.Path("project.toml").touch()
+    Path("project.toml").touch()
     for name in ("second.png", "screen.npy", "index.npy", "tolerances.toml"):
-        workflow.Path(name).write_bytes(MARK)
+        Path(name).write_bytes(MARK)
         with pytest.raises(InputError):
-            refuse_foreign(workflow.Path(name))
+            refuse_foreign(Path(name))
 
 
 def test_a_first_surface_that_changes_is_another_design(capfd):
     run(capfd, "design", "blob.png", *TINY, "-o", "first.caustic")
-    heights = workflow.Project.open("first.caustic").load().state.heights.numpy()
+    heights = Project.open("first.caustic").load().state.heights.numpy()
     np.save("start.npy", heights)
     own = ("design", "blob.png", *TINY, "--start", "start.npy", "-o", "own.caustic")
     assert run(capfd, *own)["relative_rms"] == run(capfd, *own)["relative_rms"]  # the same design is welcome

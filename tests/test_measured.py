@@ -27,11 +27,11 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.project.completion import complete
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.studies.retrace import converge
-from caustic_cli.workflow import design as workflow
 
 AT = (0.5, -0.5, -30.0)
 #: The same light as rays and as the source that they are drawn from.
@@ -288,7 +288,7 @@ def test_a_design_from_a_file_stands_alone(here, capfd, form, name):
     figures, err = run(capfd, *base)
     assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-12)
     assert figures["rays"] < 30_000 and "the ray file is coarse for 24 x 24 pixels: its 30,000 rays" in err
-    project = workflow.Project.open("blob.caustic")
+    project = Project.open("blob.caustic")
     kept = f"source{Path(name).suffix.lower()}"
     assert project.settings.source.file == kept and project.settings.source.position == ((0, 0, -40),)
     assert Path("blob.caustic", kept).read_bytes() == Path(name).read_bytes()

@@ -27,11 +27,11 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import lines_of, wave_image
 from caustic_cli.project.completion import complete
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Aperture, Disc, Lens, Light, PlaneWave, Points, Pupil, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
-from caustic_cli.workflow import design as workflow
 
 SCREEN = Screen((40.0, 32.0), 100.0, (40, 32))
 MEMBERS = (
@@ -169,7 +169,7 @@ def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     for name in ("led.dat", "led.csv"):
         Path(name).unlink()
     assert {"source-2.dat", "intensity-3.csv"} <= {p.name for p in Path("blob.caustic").iterdir()}
-    history = workflow.Project.open("blob.caustic").load().state.history
+    history = Project.open("blob.caustic").load().state.history
     assert history[-1][2] < history[0][2]
     again = run(
         "render",

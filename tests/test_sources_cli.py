@@ -13,8 +13,8 @@ from caustic_cli.config import settings
 from caustic_cli.config.design import build_stages
 from caustic_cli.errors import InputError
 from caustic_cli.project.completion import complete
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Offset, Points
-from caustic_cli.workflow import design as workflow
 
 TINY = [
     "--resolution",
@@ -73,7 +73,7 @@ def run(capfd, *arguments, code=0):
 )
 def test_every_source_designs_renders_and_exports(capfd, source):
     figures = run(capfd, "design", "blob.png", *source, *TINY, "--iterations", "8")
-    history = workflow.Project.open("blob.caustic").load().state.history
+    history = Project.open("blob.caustic").load().state.history
     assert history[-1][2] < history[0][2]
     assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-9)
     again = run(capfd, "render", "blob.caustic", "--rays", "40000", "--quiet", "--threads", "1", "--force")
@@ -134,12 +134,12 @@ def test_a_design_changes_its_source_and_resumes_inside_any_stage(capfd):
     Path("schedule.toml").write_text(SCHEDULE)
     base = ["design", "blob.png", "--config", "schedule.toml", "--resolution", "24", "--quiet", "--threads", "1"]
     run(capfd, *base, "-o", "whole.caustic")
-    whole = workflow.Project.open("whole.caustic").load().state
+    whole = Project.open("whole.caustic").load().state
     assert [row[1] for row in whole.history] == [0] * 3 + [1] * 4
     for stop in (2, 5):
         run(capfd, *base, "-o", f"{stop}.caustic", "--iterations", stop)
         run(capfd, "design", "--resume", f"{stop}.caustic", "--iterations", 7, "--quiet", "--threads", "1")
-        state = workflow.Project.open(f"{stop}.caustic").load().state
+        state = Project.open(f"{stop}.caustic").load().state
         assert [row[:4] for row in state.history] == [row[:4] for row in whole.history]
         assert bool((state.heights == whole.heights).all())
 
@@ -251,7 +251,7 @@ def test_an_option_may_be_meant_for_the_source_of_a_stage(capfd):
         "offset",
         "--quiet",
     )
-    project = workflow.Project.open("blob.caustic")
+    project = Project.open("blob.caustic")
     assert project.settings.source.type == "plane"
     assert build_stages(project.settings)[0].source == Points(((0.0, 0.0, -40.0),))
 

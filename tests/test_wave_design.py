@@ -30,7 +30,9 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.project import completion
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.light import WAVE_NODES
 from caustic_cli.studies import diffraction
 from caustic_cli.studies.metrics import relative_rms
@@ -80,11 +82,18 @@ def design(capfd, *arguments, code=0) -> dict | str:
 # loss and derivative
 
 
-@pytest.mark.parametrize("source", [None, Points(((0.1, 0.0, -80.0),)), Disc(angle=0.1)], ids=["plane", "point", "disc"])
+SCENES = {
+    "plane": scene_of(),
+    "point": scene_of(Points(((0.1, 0.0, -80.0),))),
+    "disc": scene_of(Disc(angle=0.1)),
+    "gradient index": scene_of(gradient=Gradient("radial", (-2e-2, 1e-2))),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 @pytest.mark.parametrize("how", [(), (LossImage(blur=1.0, apron=2), Limits(max_slope=0.01))], ids=["plain", "limits"])
-def test_gradient_of_the_loss(source, how):
+def test_gradient_of_the_loss(scene, how):
     """As central differences say, in float64; a unit of wavelengths at a time or all kept."""
-    scene = scene_of(source)
     heights, field = heights_of(scene), HeightField.of(scene.lens)
     made = WaveObjective(scene, field, heights, goal(), "rms-light", *how, wavelengths=(500.0, 600.0), dtype=torch.float64)
     g = torch.Generator().manual_seed(1)
@@ -199,7 +208,7 @@ def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
     monkeypatch.setattr(workflow, "_run", begun)
     small = SMALL if "--resolution" not in extra else [a for a in SMALL if a not in ("--resolution", "32")]
     design(capfd, "blob.png", *small, *extra, "-o", "p")
-    tables = workflow.Project.open("p").settings.design.stages
+    tables = Project.open("p").settings.design.stages
     assert any(t.waves for t in tables) == stages
     assert not stages or [len(t.waves) for t in tables if t.waves] == [count for count, _ in STANDARD.waves]
 

@@ -59,7 +59,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
         **dict.fromkeys(
             ("design.network", "design.optimizer", "design.loss"), "⟨{path}⟩ of a free gradient must be {default}, got {value}"
         ),
-        "design.waves on": WAVE_REFINEMENT.unsupported["gradient index"],
+        "design.waves on": "⟨design.waves⟩ on refines heights, but ⟨lens.gradient⟩ free designs the index, by rays",
     },
     "source.tilt": {
         **dict.fromkeys(
@@ -88,6 +88,7 @@ EXCLUDED_LATER: dict[str, dict[str, str]] = {
     },
     "design.waves auto": {
         **_by_settings(WAVES_BY_DEFAULT),
+        "lens.gradient free": "a free gradient is designed by rays",
         "design.network": "a network is trained on rays alone; ⟨network⟩ none refines it",
         "design.optimizer": "{value} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it",
     },

@@ -94,6 +94,10 @@ class Aim(NamedTuple):
     error: float
     seconds: float
 
+    def closer(self, judged: float) -> Aim:
+        """The aim of a design that ended for this one and was judged to have a larger error by more light."""
+        return self._replace(error=self.error * self.error / judged)
+
 
 def seconds_to(rows: Sequence[Row], error: float) -> float | None:
     """Further seconds until an error is reached, extrapolated from the last rows: a power of the time from the initial lens;

@@ -30,6 +30,7 @@ from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, Project
 from caustic_cli.scene import Scene
 from caustic_cli.workflow.compilation import announce_compilation, compile_design, compile_for
+from caustic_cli.workflow.estimate import noise_of
 from caustic_cli.workflow.evaluation import evaluate_and_write, evaluation_seconds, expected_seconds, prepare_report
 from caustic_cli.workflow.movie import NoMovie
 from caustic_cli.workflow.preparation import PreparedDesign, solved
@@ -79,7 +80,11 @@ def design(
         state = Designer(problem).initial_state(*first or ())
         if problem.in_stages:
             _say_limits(project, problem, first, say)
-        return _run(project, problem, state, say, began, None, movie, aim)
+        result = _run(project, problem, state, say, began, None, movie, aim)
+        if aim and result.state.reason == REACHED and result.figures["error"] > aim.error + noise_of(result.figures):
+            closer = aim.closer(result.figures["error"])
+            result = _run(project, problem, Designer(problem).restored(result.state), say, began, None, movie, closer)
+        return result
 
 
 def _again(project: Project, device: str, say: Reporter, began: Start, movie: NoMovie, aim: Aim | None) -> Result:

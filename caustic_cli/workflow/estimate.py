@@ -4,9 +4,9 @@ Cost model: the time of a design is the sum of the work of its parts (`work_of`:
 the time of a unit of each on a reference machine (`SECONDS`), times how much slower this machine is: `slowness` measures that in
 half a second and keeps it for an hour.  Memory likewise (`MIBS`).
 
-Error model: the logarithm of the error is linear in figures of picture and scene (`features_of`), with coefficients for each
-quality, by rays and by waves (`ERRORS`).  Both models are fitted to measured designs by `tests/benchmarks/plan.py`, which also
-judges them by pictures left out.
+Error model: the logarithm of the error, beside what is left of any picture (`LEAST`), is linear in figures of picture and scene
+(`features_of`), with coefficients for each quality, by rays and by waves (`ERRORS`).  Both models are fitted to measured designs by
+`tests/benchmarks/plan.py`, which also judges them by pictures left out.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -75,11 +75,13 @@ class Work(NamedTuple):
 SECONDS = Work(6.68, 1.03, 0.0362, 0.0292, 0.0276, 0.018, 0.00574)
 #: MiB for a unit of each part of `memory_of`.
 MIBS = (735.0, 233.0, 83.0)
+#: Error of designs of the smoothest pictures, by judge.
+LEAST = {"waves": 0.02, "rays": 0.0}
 #: Judge and quality -> coefficients of `features_of`, and the standard deviation of the logarithm of the error about them.
 ERRORS: dict[tuple[str, str], tuple[tuple[float, ...], float]] = {
     ("waves", "draft"): ((-1.124, 0.622, -0.03, -0.012, 0.0), 0.173),
-    ("waves", "standard"): ((-2.928, 0.981, -0.065, 1.288, -0.661), 0.345),
-    ("waves", "fine"): ((-0.686, 1.132, 0.092, 0.0, -0.659), 0.33),
+    ("waves", "standard"): ((-3.08, 1.07, -0.1, 1.44, -0.78), 0.303),
+    ("waves", "fine"): ((-0.64, 1.31, -0.14, 0.0, -1.14), 0.259),
     ("rays", "draft"): ((-2.429, 0.311, 0.037, 0.001, 0.0), 0.197),
     ("rays", "standard"): ((-2.524, 0.395, 0.298, 0.216, 0.0), 0.247),
     ("rays", "fine"): ((-2.2, 0.399, 0.345, 0.0, 0.0), 0.18),
@@ -119,6 +121,11 @@ def features_of(problem: OneSurface, size: tuple[float, float]) -> np.ndarray:
     seen = Resolution.before(problem.scene, size)
     blur, contrast = seen.diffraction / seen.pixel, float(target.std() / target.mean())
     return np.array([1.0, *(math.log(max(value, 1e-3)) for value in (detail, bright, blur, contrast))])
+
+
+def expected_error(coefficients: Sequence[float], features: np.ndarray, by: str) -> float:
+    """The error by a judge, from coefficients of `ERRORS` and `features_of`."""
+    return math.hypot(math.exp(float(features @ np.array(coefficients))), LEAST[by])
 
 
 def cut_off_error(problem: OneSurface) -> float:
@@ -206,9 +213,9 @@ def estimate(project: Project, quality: str, slow: tuple[float, float]) -> Estim
     factors = Work(slow[1], slow[1], slow[1], slow[1], slow[0], slow[0], slow[1])
     seconds = sum(a * b * c for a, b, c in zip(SECONDS, work, factors, strict=True))
     coefficients, spread = ERRORS[by, quality]
-    logarithm = float(features_of(problem, s.target.size) @ np.array(coefficients))
+    own = expected_error(coefficients, features_of(problem, s.target.size), by)
     bound = cut_off_error(problem) if by == "waves" else 0.0
-    error = math.hypot(math.exp(logarithm), bound)
+    error = math.hypot(own, bound)
     net = problem.stages[-1].control
     memory = sum(a * b for a, b in zip(MIBS, memory_of(problem, work), strict=True))
     size = 2.0 * expected_bytes(math.prod(net)) / MIB + PICTURES
@@ -291,10 +298,14 @@ def cheapest(
     return [(e.quality, Aim(error, seconds)) for e, seconds in zip(found[first:], longest, strict=True)]
 
 
+def noise_of(figures: Mapping[str, Any]) -> float:
+    """What the judge's own light leaves uncertain of an error, by the figures of a design."""
+    return (figures.get("noise") or 0.0) if figures["error_by"] == "rays" else figures.get("wave_spectral_error") or 0.0
+
+
 def reached(figures: Mapping[str, Any], error: float, quality: str, say: Reporter) -> bool:
     """Whether a lens has at most this error, within its noise; if not, says what follows."""
-    noise = (figures.get("noise") or 0.0) if figures["error_by"] == "rays" else figures.get("wave_spectral_error") or 0.0
-    if figures["error"] <= error + noise:
+    if figures["error"] <= error + noise_of(figures):
         return True
     last = quality == QUALITIES[-1]
     say.say(f"{quality}: error of {figures['error']:.3g}, more than {error:g}" + (": no quality reaches it" if last else ""))

@@ -28,8 +28,8 @@ from caustic_cli.workflow.reporter import Reporter
 
 #: Time of a checkpoint, s, beyond which the interval to the next one grows, and the factor of the excess.
 QUICK, RARELY = 0.5, 10.0
-#: Time that further iterations get to reach an error, over what is expected.
-LONGER = 2.0
+#: Further iterations, of those done, after which it is decided anew whether more should reach an error.
+FURTHER = 0.125
 
 
 class Watch:
@@ -44,8 +44,8 @@ class Watch:
         lasting = [s for s in designer.stages if not s.spare] or designer.stages
         self.total = self.chosen.iterations or sum(s.iterations for s in lasting)
         self.stage, self.saved = -1, time.monotonic()
-        self.now: State | None = None
-        self.until = -math.inf  # when further iterations end
+        self.now = state
+        self.late: float | None = None  # when further iterations began
         self.show: Callable[..., None] = lambda *progress: None
         error_of, count = partial(designer.problem.error_of, designer), designer.problem.effort.cost_points
         self.cost = CostOfAccuracy(began, error_of, self.total, count, state.accuracy)
@@ -58,7 +58,7 @@ class Watch:
     def reaches(self, aim: Aim | None) -> bool:
         """Whether the lens has at most this error, which is measured anew where the loss says that it may."""
         now = self.now
-        if aim is None or now is None or not now.accuracy:
+        if aim is None or not now.accuracy:
             return False
         last, losses = now.accuracy[-1], {0: math.inf} | {row[0]: row[2] for row in now.history}
         if last.iteration < now.total and last.error * losses[now.total] <= aim.error * losses[last.iteration]:
@@ -68,14 +68,17 @@ class Watch:
     def goes_on(self, aim: Aim | None) -> bool:
         """Whether iterations beyond those of the stages should reach an error in the time that they may take."""
         now = self.now
-        if aim is None or now is None:
+        if aim is None:
             return False
-        if self.until < 0:
-            self.measure(now, always=True)
-            more = seconds_to(now.accuracy, aim.error)
-            expected = more is not None and more <= aim.seconds
-            self.until = time.monotonic() + min(aim.seconds, LONGER * more) if expected else 0.0
-        return time.monotonic() < self.until
+        if now.total < self.total:
+            return True
+        self.measure(now, always=True)
+        self.late = self.late or now.seconds
+        more = seconds_to(now.accuracy, aim.error)
+        if more is None or now.seconds - self.late + more > aim.seconds:
+            return False
+        self.total = now.total + max(1, round(FURTHER * now.total))
+        return True
 
     def __call__(self, now: State) -> None:
         self.now = now

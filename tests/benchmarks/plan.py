@@ -20,7 +20,7 @@ from PIL import Image
 from quality import DATA, EXAMPLES
 from quality import pictures as photographs
 from scipy.ndimage import gaussian_filter
-from scipy.optimize import nnls
+from scipy.optimize import least_squares, nnls
 
 from caustic_cli.config.wave_stages import transform_samples
 from caustic_cli.optics.resolution import Resolution
@@ -30,8 +30,8 @@ from caustic_cli.workflow import estimate
 QUALITIES = ("draft", "standard", "fine")
 #: Options of further scenes, each of the first pictures.
 SCENES = (("--mag", "1.5"), ("--resolution", "128"), ("--lens-size", "20"), ("--throw", "150"))
-#: Ridge of the regression: the figures of pictures are alike.
-RIDGE = 0.005
+#: Ridge of the regression: the figures of pictures are alike; and the deviation of the error that is allowed.
+RIDGE, GOAL = 0.02, 0.3
 #: Weight of the seconds before in a fit, of a design's.
 KEPT = 0.1
 RESULTS = "designs.jsonl"
@@ -127,7 +127,7 @@ def fit_errors(cases: list[dict]) -> None:
             own = [c for c in cases if (c["error_by"], c["quality"]) == (by, quality)]
             if len(own) < 3:
                 continue
-            left = [np.log(c["error"]) - predicted(regression([o for o in own if o["picture"] != c["picture"]]), c) for c in own]
+            left = [np.log(c["error"] / predicted(regression([o for o in own if o["picture"] != c["picture"]]), c)) for c in own]
             near, whole = near + sum(abs(np.exp(-value) - 1.0) <= 0.3 for value in left), whole + len(left)
             spread = float(np.sqrt(np.mean(np.square(left))))
             estimate.ERRORS[by, quality] = tuple(np.round(regression(own), 3).tolist()), round(spread, 3)
@@ -136,17 +136,23 @@ def fit_errors(cases: list[dict]) -> None:
 
 
 def regression(own: list[dict]) -> np.ndarray:
-    """Coefficients of the logarithm of the error, with a ridge on all but the first."""
+    """Coefficients of the logarithm of the error, with a ridge on all but the first, by the fourth power of its deviations over
+    GOAL: the goal is a bound."""
     x, y = np.array([c["features"] for c in own]), np.log([c["error"] for c in own])
     middle = x[:, 1:].mean(0)
-    z = x[:, 1:] - middle
-    slopes = np.linalg.solve(z.T @ z + RIDGE * len(own) * np.eye(z.shape[1]), z.T @ (y - y.mean()))
-    return np.array([y.mean() - middle @ slopes, *slopes])
+
+    def deviations(w: np.ndarray) -> np.ndarray:
+        found = [predicted(np.array([w[0] - middle @ w[1:], *w[1:]]), one) for one in own]
+        off = (np.log(found) - y) / GOAL
+        return np.concatenate([np.sign(off) * off * off, np.sqrt(RIDGE * len(own)) * w[1:]])
+
+    w = least_squares(deviations, [y.mean(), *np.zeros(x.shape[1] - 1)]).x
+    return np.array([w[0] - middle @ w[1:], *w[1:]])
 
 
 def predicted(coefficients: np.ndarray, one: dict) -> float:
-    """Logarithm of the error."""
-    return float(one["features"] @ coefficients)
+    """The error."""
+    return estimate.expected_error(coefficients, one["features"], one["error_by"])
 
 
 def fit_seconds(cases: list[dict]) -> None:
@@ -171,7 +177,7 @@ def judge(cases: list[dict]) -> None:
     near = [0, 0]
     for c in cases:
         coefficients, spread = estimate.ERRORS[c["error_by"], c["quality"]]
-        error, seconds = np.exp(predicted(np.array(coefficients), c)), float(np.dot(estimate.SECONDS, c["work"]))
+        error, seconds = predicted(np.array(coefficients), c), float(np.dot(estimate.SECONDS, c["work"]))
         memory = float(np.dot(estimate.MIBS, c["memory"]))
         near[0] += abs(seconds / c["wall"] - 1.0) <= 0.25
         near[1] += abs(error / c["error"] - 1.0) <= 0.3

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from caustic_cli.optics.effects.base import Decision, Effect
 from caustic_cli.optics.resolution import WIDENED
-from caustic_cli.optics.waves.unsupported import NOT_IMPLEMENTED, WAVE_IMAGE
+from caustic_cli.optics.waves.unsupported import WAVE_IMAGE
 from caustic_cli.scene import Scene
 
 
@@ -21,8 +21,7 @@ class Diffraction(Effect):
         """Needed if it increases the blur of source and pixel noticeably."""
         r = bounds.resolution
         if obstacle := WAVE_IMAGE.obstacle(scene):
-            why, fixed = WAVE_IMAGE.unsupported[obstacle], obstacle in NOT_IMPLEMENTED
-            return Decision(self.name, False, why, r.widened, WIDENED, fixed=fixed)
+            return Decision(self.name, False, WAVE_IMAGE.unsupported[obstacle], r.widened, WIDENED)
         light = f"{r.wavelength:.4g} nm" if r.said else f"{r.wavelength:.4g} nm, as the scene says no wavelength,"
         blur, source, pixel = (f"{width:.2g} {r.unit}" for width in (r.diffraction, r.source, r.pixel))
         why = f"light of {light} blurs over {blur}, the source over {source}, a pixel is {pixel}"

@@ -133,8 +133,10 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
     states = (0.0, 90.0) if scene.light.tracked and scene.light.polarisation is None else (scene.light.polarisation,)
     of_each = zip(given, parts, channels, scene.light.colours_of(given), strict=True)
     for k, (wavelength, part, channel, colour) in enumerate(of_each):
-        lens = replace(scene.lens, roughness=0.0)
-        if (glass := lens.interior.glass) is not None:
+        lens, label = replace(scene.lens, roughness=0.0), None
+        if (glass := lens.interior.glass) is not None and lens.gradient is not None:
+            label = wavelength  # its medium scales the whole field
+        elif glass is not None:
             lens = replace(lens, index=nearest_index(glass, wavelength))
         elements = tuple(e.at(wavelength) for e in scene.elements)
         indices = (lens.index, *(e.index for e in elements))
@@ -143,7 +145,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
                 one = replace(scene, lens=lens, elements=elements, light=Light(state))
                 systems[indices, state] = System.of(one, field)
             found.append(
-                Line(wavelength, part / len(states), systems[indices, state], None, channel, colour, k % 2 if continuous else None)
+                Line(wavelength, part / len(states), systems[indices, state], label, channel, colour, k % 2 if continuous else None)
             )
     return found
 

@@ -22,13 +22,11 @@ WAVE_IMAGE = Capability(
     {
         "ray file": "a ray file contains no phase",
         "curved screen": "a curved screen has no wave image",
-        "gradient index": "wave images are implemented for homogeneous lenses only",
     },
 )
 WAVE_REFINEMENT = Capability(
     "design by waves",
     {
-        "gradient index": "⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image",
         "ray file": "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
         "curved screen": "⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine",
         "several sources": "⟨design.waves⟩ on needs one source: light of several is refined by rays alone",
@@ -38,8 +36,8 @@ WAVE_REFINEMENT = Capability(
 )
 WAVES_BY_DEFAULT = Capability(
     "design by waves unless asked for",
-    {name: WAVE_IMAGE.unsupported[name] for name in ("gradient index", "ray file")}
-    | {
+    {
+        "ray file": WAVE_IMAGE.unsupported["ray file"],
         "several sources": "light of several sources is refined by rays alone",
         "curved screen": WAVE_IMAGE.unsupported["curved screen"],
         "other elements": "behind other elements it takes many samples, or a part of the light; ⟨waves⟩ on refines it all the same",
@@ -50,8 +48,6 @@ WAVES_BY_DEFAULT = Capability(
         " light; ⟨waves⟩ on refines it all the same",
     },
 )
-#: Of the scenes without a wave image, the limits of what is implemented, so that the effect cannot be asked for.
-NOT_IMPLEMENTED = ("gradient index",)
 
 
 def receiver_of(system: System, screen: Screen | PlacedScreen) -> Receiver:
