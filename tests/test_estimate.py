@@ -125,12 +125,12 @@ def test_a_design_for_an_error_takes_the_cheapest_and_stops_there(capfd, monkeyp
 def test_a_design_for_an_error_takes_further_iterations_that_should_reach_it(capfd, monkeypatch):
     Path("few.toml").write_text("[[design.stages]]\niterations = 6\nrays = 40_000\n")
     few = [*SMALL, "--start", "offset", "--config", "few.toml", "--force"]
-    planned = figures_of(capfd, "--quality", "draft", *few)
+    planned = figures_of(capfd, *few)
     assert planned["iterations"] == 6
-    monkeypatch.setattr(estimate, "cheapest", lambda *_, **__: [("draft", Aim(0.9 * planned["error"], 60.0))])
+    monkeypatch.setattr(estimate, "cheapest", lambda *_, **__: [(None, Aim(0.9 * planned["error"], 60.0))])
     found = figures_of(capfd, "--error", "0.1", *few)
     assert 6 < found["iterations"] < 30 and found["error"] <= 0.9 * planned["error"] + found["noise"]
-    monkeypatch.setattr(estimate, "cheapest", lambda *_, **__: [("draft", Aim(1e-6, 60.0))])
+    monkeypatch.setattr(estimate, "cheapest", lambda *_, **__: [(None, Aim(1e-6, 60.0))])
     assert figures_of(capfd, "--error", "0.1", *few)["iterations"] == 6
 
 
@@ -139,12 +139,13 @@ def test_a_design_goes_on_and_says_what_no_quality_reaches(monkeypatch):
     monkeypatch.setattr(estimate, "ERRORS", fixed)
     said: list[str] = []
     say = Listener(on_message=said.append)
-    qualities, aims = zip(*estimate.cheapest(Path("blob.png"), {"screen.resolution": (24, 24)}, 0.02, say), strict=True)
+    given = {"screen.resolution": (24, 24), "design.waves": "off"}
+    qualities, aims = zip(*estimate.cheapest(Path("blob.png"), given, 0.02, say), strict=True)
     assert qualities == ("draft", "standard", "fine") and "draft: an error of 0.01" in said[0]
     assert {aim.error for aim in aims} == {0.02} and aims[0].seconds <= aims[1].seconds == aims[2].seconds
     figures = {"error": 0.03, "error_by": "rays", "noise": 0.001}
     assert not estimate.reached(figures, 0.02, "draft", say) and not said[-1].endswith("no quality reaches it")
     assert not estimate.reached(figures, 0.02, "fine", say) and said[-1].endswith("no quality reaches it")
     assert estimate.reached(figures, 0.0295, "fine", say)
-    estimate.cheapest(Path("blob.png"), {"screen.resolution": (24, 24)}, 0.005, say)
+    estimate.cheapest(Path("blob.png"), given, 0.005, say)
     assert "less than any quality is expected to reach" in said[-1]

@@ -87,6 +87,7 @@ SCENES = {
     "point": scene_of(Points(((0.1, 0.0, -80.0),))),
     "disc": scene_of(Disc(angle=0.1)),
     "gradient index": scene_of(gradient=Gradient("radial", (-2e-2, 1e-2))),
+    "curved screen": replace(scene_of(), screen=Screen((5.0, 5.0), 60.0, (32, 32), radius=(12.0, 12.0))),
 }
 
 
@@ -225,7 +226,7 @@ OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"
         (["--source-angle", "3"], ""),
         (["--network", "sparse"], "a network is trained on rays alone; --network none refines it"),
         (["--optimizer", "adam"], "adam was asked for, and the wave image takes lbfgs; --waves on adds"),
-        (["--screen-tilt", "0,10"], "on a tilted screen it takes many transforms for each wavelength; --waves on"),
+        (["--screen-tilt", "0,10"], "on a tilted or curved screen it takes many transforms for each wavelength; --waves on"),
         (["--quality", "fine"], "5 iterations on it would take longer than this quality's time; --waves on"),
         (["--config", "own.toml", "--control", "19"], "none of the given [[design.stages]] has waves; one with waves = [550.0]"),
     ],

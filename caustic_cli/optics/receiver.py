@@ -146,8 +146,9 @@ class Receiver:
 
     @property
     def across(self) -> bool:
-        """Whether it is perpendicular to the axis, and not rotated about that, or the far field."""
-        return self.screen.far or (abs(dot(self.axes[2], self.axis)) >= ACROSS and not any(self.screen.tilt[2:]))
+        """Whether it is plane, perpendicular to the axis, and not rotated about that, or the far field."""
+        upright = abs(dot(self.axes[2], self.axis)) >= ACROSS and not any(self.screen.tilt[2:])
+        return self.screen.far or (upright and not self.screen.curved)
 
     def corners(self) -> list[Vector]:
         """Its four corners in space, mm."""

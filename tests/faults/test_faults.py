@@ -25,6 +25,7 @@ from caustic_cli.project import checkpoint, directory
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import preparation
 
 DESIGN = [
     "design",
@@ -69,6 +70,7 @@ FULL = """
 import json, resource, sys
 from caustic_cli import cli
 from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import preparation
 resource.setrlimit(resource.RLIMIT_FSIZE, (9500, 9500))  # writing beyond fails as on a full disk
 for arguments in json.load(sys.stdin):
     print(cli.run(arguments), flush=True)
@@ -269,5 +271,5 @@ def test_memory_short_anywhere_is_one_sentence(error, monkeypatch, capfd):
     def prepare(*args, **options):
         raise error
 
-    monkeypatch.setattr(workflow, "prepare", prepare)
+    monkeypatch.setattr(preparation, "prepare", prepare)
     assert "out of memory" in run(DESIGN, capfd, 1)

@@ -53,19 +53,37 @@ def test_hardly_tilted():
     assert apart(tilted, upright) < 0.005
 
 
-@pytest.mark.parametrize("tilt", [(0.0, 60.0), (50.0, 0.0), (0.0, -30.0)])
-def test_slit_on_a_tilted_screen(tilt):
-    """Fresnel's pattern at every point's own distance, less light by the cosine: 0.03 of the incident irradiance."""
+UPRIGHT, FLAT = (0.0, 0.0), (math.inf, math.inf)
+
+
+@pytest.mark.parametrize(
+    ("tilt", "radius"),
+    [
+        ((0.0, 60.0), FLAT),
+        ((50.0, 0.0), FLAT),
+        ((0.0, -30.0), FLAT),
+        (UPRIGHT, (-2.5, -2.5)),
+        (UPRIGHT, (2.0, math.inf)),
+        ((0.0, 30.0), (6.0, 6.0)),
+    ],
+)
+def test_slit_on_a_tilted_or_curved_screen(tilt, radius):
+    """Fresnel's pattern at every point's own distance, on the area of the screen: 0.03 of the incident irradiance."""
     half = 0.4
-    screen = Screen((3.0, 3.0), 32.0, (60, 60), tilt=tilt)
+    screen = Screen((3.0, 3.0), 32.0, (60, 60), tilt=tilt, radius=radius)
     scene = scene_of(2.0 * half, screen)
     field, heights = flat(scene)
     found = irradiance(wave_image(scene, field, heights, finer=3.0, dtype=DOUBLE), screen, 4.0 * half * half)
     fine = 4
     a, b = (0.75 * 2.0 * ((np.arange(60 * fine) + 0.5) / (60 * fine) - 0.5) * 2.0 for _ in range(2))
     u, v, n = (np.array(c) for c in screen.axes)
-    x, y, z = (u[k] * a[:, None] + v[k] * b[None, :] for k in range(3))
-    exact = slit(x, half, LAMBDA, 30.0 + z) * slit(y, half, LAMBDA, 30.0 + z) * abs(n[2])
+    r2 = sum(at**2 * math.isfinite(c) for c, at in zip(radius, (a[:, None], b[None, :]), strict=True))
+    bend = min(radius, key=abs)
+    s = bend - math.copysign(1.0, bend) * np.sqrt(bend**2 - r2) if math.isfinite(bend) else np.zeros((len(a), len(b)))
+    x, y, z = (u[k] * a[:, None] + v[k] * b[None, :] + n[k] * s for k in range(3))
+    sx, sy = np.gradient(s, a, b, edge_order=2)
+    across = np.abs(n[2] - sx * u[2] - sy * v[2])
+    exact = slit(x, half, LAMBDA, 30.0 + z) * slit(y, half, LAMBDA, 30.0 + z) * across
     exact = exact.reshape(60, fine, 60, fine).mean((1, 3))
     error = np.abs(found - exact)
     assert error.max() < 0.04 and math.sqrt((error**2).mean()) < 0.008
@@ -81,11 +99,13 @@ def test_tilted_screen_catches_all(source):
     assert float(found.image.sum()) == pytest.approx(found.leaving, rel=5e-3)
 
 
+@pytest.mark.parametrize("radius", [FLAT, (-6.0, -6.0), (math.inf, 4.0)], ids=["plane", "sphere", "cylinder"])
 @pytest.mark.parametrize("kind", ["plane", "point"])
-def test_tilted_against_rays(kind):
-    """Where pixels are coarse the tilted image of waves is that of rays."""
+def test_tilted_against_rays(kind, radius):
+    """Where pixels are coarse the image of waves on a tilted or curved screen is that of rays."""
     source = PlaneWave() if kind == "plane" else Points(((1.0, 0.5, -60.0),))
-    screen = Screen((5.0, 4.5), 42.0, (8, 7), tilt=(-20.0, 30.0), shift=(0.2, -0.1))
+    tilt = (-20.0, 30.0) if radius == FLAT else (10.0, 15.0)
+    screen = Screen((5.0, 4.5), 42.0, (8, 7), tilt=tilt, radius=radius, shift=(0.2, -0.1))
     scene = scene_of(2.0, screen, source)
     field, heights = wavy(scene, 2e-3, 60.0)
     found = wave_image(scene, field, heights)

@@ -28,6 +28,7 @@ from caustic_cli.optics.spread import POINT, Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.waves.imaged_exit import ImagedExit
+from caustic_cli.optics.waves.planes import PlanesExposure, power_by_planes
 from caustic_cli.optics.waves.propagation import (
     TURN,
     Exposure,
@@ -40,7 +41,6 @@ from caustic_cli.optics.waves.propagation import (
     pruning_pays,
 )
 from caustic_cli.optics.waves.sampling import Sampling, memory_free
-from caustic_cli.optics.waves.tilted import TiltedExposure, power_on_tilted
 from caustic_cli.optics.waves.unsupported import NoWaveImage, receiver_of
 from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, survey, wavefront
 from caustic_cli.scene import Light, Scene, Screen, Source
@@ -446,10 +446,10 @@ class Imager:
             return phase_of(path, s, line.length, line.behind).to(dtype), amplitude.to(dtype)
         return backend_for(path.device).phase(path, s, line.length, line.behind, dtype), amplitude.to(dtype)
 
-    def exposure(self, line: Line, front: Wavefront, dtype: torch.dtype) -> Exposure | TiltedExposure:
+    def exposure(self, line: Line, front: Wavefront, dtype: torch.dtype) -> Exposure | PlanesExposure:
         """Power on the (subdivided) pixels as a function of a change of the optical paths of a wavefront."""
         if not self.receiver.across:
-            return TiltedExposure(self.receiver, self.sampling, self.watched(front, line.behind), line.length, line.behind, dtype)
+            return PlanesExposure(self.receiver, self.sampling, self.watched(front, line.behind), line.length, line.behind, dtype)
         phase, amplitude = self.field(line, front, dtype)
         return backend_for(phase.device).exposure(phase, amplitude, TURN / line.length, self.sampling.padded, self.edges(line))
 
@@ -457,7 +457,7 @@ class Imager:
         """Power on pixels of one mode, by its number, at one wavelength, float64, and its total power."""
         s, wide = self.sampling, 8 if dtype == torch.float32 else 16
         if not self.receiver.across:
-            found = power_on_tilted(self.receiver, s, self.watched(front, line.behind), line.length, line.behind, dtype)
+            found = power_by_planes(self.receiver, s, self.watched(front, line.behind), line.length, line.behind, dtype)
             return found, front.power
         if torch.is_grad_enabled() and front.path.requires_grad:
             self._check_memory(wide)

@@ -21,14 +21,12 @@ WAVE_IMAGE = Capability(
     "wave image",
     {
         "ray file": "a ray file contains no phase",
-        "curved screen": "a curved screen has no wave image",
     },
 )
 WAVE_REFINEMENT = Capability(
     "design by waves",
     {
         "ray file": "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
-        "curved screen": "⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine",
         "several sources": "⟨design.waves⟩ on needs one source: light of several is refined by rays alone",
         "two sides": "⟨design.waves⟩ on: two free-form sides are refined by rays alone, since those of a picture's creases cross"
         " inside the glass, so that the light behind it has no single wavefront",
@@ -39,11 +37,13 @@ WAVES_BY_DEFAULT = Capability(
     {
         "ray file": WAVE_IMAGE.unsupported["ray file"],
         "several sources": "light of several sources is refined by rays alone",
-        "curved screen": WAVE_IMAGE.unsupported["curved screen"],
         "other elements": "behind other elements it takes many samples, or a part of the light; ⟨waves⟩ on refines it all the same",
         "lenslet array": "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on"
         " refines it",
-        "tilted screen": "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same",
+        **dict.fromkeys(
+            ("tilted screen", "curved screen"),
+            "on a tilted or curved screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same",
+        ),
         "tilted light": "in tilted light it holds for surfaces that are smooth over the Fresnel scale of their depth along the"
         " light; ⟨waves⟩ on refines it all the same",
     },
@@ -55,13 +55,11 @@ def receiver_of(system: System, screen: Screen | PlacedScreen) -> Receiver:
 
     Raises:
         InputError: it is nearly parallel to the axis.
-        NoWaveImage: it is curved, or the rays are those of a file.
+        NoWaveImage: the rays are those of a file.
     """
     if system.source.rays is not None:
         raise NoWaveImage(f"{WAVE_IMAGE.unsupported['ray file']}, so that it has no wave image")
     found = Receiver.of(system, screen)
-    if found.screen.curved:
-        raise NoWaveImage(f"{WAVE_IMAGE.unsupported['curved screen']}: the field is taken on planes")
     if abs(dot(found.axes[2], found.axis)) < LEAST_COSINE:
         raise InputError("⟨screen.tilt⟩ makes the screen nearly parallel to the light, where there is no wave image")
     return found

@@ -1,4 +1,4 @@
-"""Wave images on tilted screens, from a stack of planes normal to the axis.
+"""Wave images on tilted and curved screens, from a stack of planes normal to the axis.
 
 Notation, on a plane at distance L_k, for light with intercepts x on the reference plane (see `wavefront`)
     U, U_x      propagated fields of u and of x u
@@ -6,9 +6,9 @@ Notation, on a plane at distance L_k, for light with intercepts x on the referen
     d           P / |U|^2 of the light as a whole, from a linear fit of the map from intercepts to landing points
 
 A point of the screen at height z above the nearest plane takes |U|^2 and P from the point where its light crosses that plane,
-(X - z a) / (1 + z b) with d = a + b X, diluted by 1 + z b along each axis.  Its irradiance is |U|^2 n_z + P . n, n the screen's
-normal.  The planes are so close that deviations from the linear map, and interference fringes of two pixels, shift by less than
-STEP of a pixel in between.
+(X - z a) / (1 + z b) with d = a + b X, diluted by 1 + z b along each axis.  Its power per area of the pixel's cell in the tangent
+plane is |U|^2 n_z + P . n, n the screen's normal of the length of its area over that of the cell.  The planes are so close that
+deviations from the linear map, and interference fringes of two pixels, shift by less than STEP of a pixel in between.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from caustic_cli.optics.waves.wavefront import Wavefront
 STEP, MOST_PLANES, A_PIXEL = 0.2, 400, 4
 
 
-def power_on_tilted(r: Receiver, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype) -> Tensor:
-    """Power of one wavefront on a tilted screen's pixels, float64.
+def power_by_planes(r: Receiver, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype) -> Tensor:
+    """Power of one wavefront on the pixels of a tilted or curved screen, float64.
 
     length, behind: wavelength in vacuum and in the image space, mm.
 
@@ -38,7 +38,6 @@ def power_on_tilted(r: Receiver, s: Sampling, front: Wavefront, length: float, b
         NoWaveImage: too many planes are needed.
     """
     plane = r.plane
-    e1, e2, e3 = plane.axes
     device = front.path.device
     if not bool((front.density > 0).any()):  # no light lands near the screen
         return torch.zeros(r.resolution, dtype=torch.float64, device=device)
@@ -46,10 +45,17 @@ def power_on_tilted(r: Receiver, s: Sampling, front: Wavefront, length: float, b
         r.low[k] + r.pixel[k] * (torch.arange(A_PIXEL * r.resolution[k], dtype=torch.float64, device=device) + 0.5) / A_PIXEL
         for k in (0, 1)
     )
-    x, y, z = (dot(r.middle, e) + dot(r.axes[0], e) * u[:, None] + dot(r.axes[1], e) * v[None, :] for e in (e1, e2, e3))
+    u, v = (c.expand(len(u), len(v)) for c in (u[:, None], v[None, :]))
+    sag, *slopes = (torch.from_numpy(c).to(device) for c in r.shape.at(u.cpu().numpy(), v.cpu().numpy()))
+
+    def turned(vector: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """From the screen's frame to the plane's."""
+        return tuple(torch.stack([dot(a, e) * c for a, c in zip(r.axes, vector, strict=True)]).sum(0) for e in plane.axes)
+
+    x, y, z = (c + dot(r.middle, e) for c, e in zip(turned((u, v, sag)), plane.axes, strict=True))
     z = z - plane.z  # above the plane through the screen's centre
-    facing = dot(r.axes[2], e3)
-    nx, ny, nz = (math.copysign(1.0, facing) * dot(r.axes[2], e) for e in (e1, e2, e3))
+    facing = math.copysign(1.0, dot(r.axes[2], plane.axes[2]))
+    normal = turned((-facing * slopes[0], -facing * slopes[1], torch.full_like(sag, facing)))
 
     path, root, lit = front.on(s.low, s.step, s.count).rows()
     amplitude = root * lit
@@ -60,24 +66,24 @@ def power_on_tilted(r: Receiver, s: Sampling, front: Wavefront, length: float, b
     planes = max(1, math.ceil(2.0 * depth * residual / (2.0 * STEP * min(r.pixel))))
     if planes > MOST_PLANES:
         raise NoWaveImage(
-            f"a wave image of this tilted screen needs {planes} planes, at most {MOST_PLANES} are made: less tilt or"
+            f"a wave image of this screen needs {planes} planes, at most {MOST_PLANES} are made: less tilt, less curvature or"
             " larger pixels need fewer"
         )
-    image = torch.zeros(u.numel(), v.numel(), dtype=torch.float64, device=device)
+    image = torch.zeros_like(z)
     height = 2.0 * depth / planes
     for k in range(planes):
-        at = -depth + (k + 0.5) * height
-        here = (z - at).abs() <= 0.5 * height * (1.0 + 1e-12)
+        above = -depth + (k + 0.5) * height
+        here = (z - above).abs() <= 0.5 * height * (1.0 + 1e-12)
         if not bool(here.any()):
             continue
         image = image + _through(
-            replace(s, distance=s.distance + at),
+            replace(s, distance=s.distance + above),
             path,
             amplitude,
             foot,
             maps,
-            (x, y, z - at),
-            (nx, ny, nz),
+            (x, y, z - above),
+            normal,
             here,
             length,
             behind,
@@ -89,8 +95,8 @@ def power_on_tilted(r: Receiver, s: Sampling, front: Wavefront, length: float, b
     return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell
 
 
-class TiltedExposure:
-    """`propagation.Exposure` of a tilted screen; arguments: as of `power_on_tilted`."""
+class PlanesExposure:
+    """`propagation.Exposure` of such a screen; arguments: as of `power_by_planes`."""
 
     def __init__(self, r: Receiver, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype):
         self.front, self.rest = front, (length, behind, dtype)
@@ -106,7 +112,7 @@ class TiltedExposure:
         """As of `propagation.Exposure`."""
         with torch.set_grad_enabled(keep):
             leaf = change.detach().requires_grad_(keep)
-            found = power_on_tilted(self.receiver, self.sampling, replace(self.front, path=self.front.path + leaf), *self.rest)
+            found = power_by_planes(self.receiver, self.sampling, replace(self.front, path=self.front.path + leaf), *self.rest)
         self.kept = (leaf, found) if keep else None
         return found.detach()
 
@@ -134,20 +140,21 @@ def _through(s, path, amplitude, foot, maps, point, normal, here, length, behind
         (grid * density - (fields[0].conj() * moved).real / (dx * dy)) / s.distance
         for grid, moved in ((grid_x[:, None], fields[1]), (grid_y[None, :], fields[2]))
     ]
-    total = density * normal[2] + flux[0] * normal[0] + flux[1] * normal[1]
+    power = torch.stack([*flux, density])
     for axis, width in ((0, pixel[0] / dx), (1, pixel[1] / dy)):  # average over the area between the sample points
         half = int(0.5 * width / A_PIXEL)
         if half > 0:
             size, pad = ((2 * half + 1, 1), (half, 0)) if axis == 0 else ((1, 2 * half + 1), (0, half))
-            total = torch.nn.functional.avg_pool2d(total[None, None], size, 1, pad)[0, 0]
+            power = torch.nn.functional.avg_pool2d(power[None], size, 1, pad)[0]
     thinner = [1.0 + z * b for _, b, _ in maps]
     at_x, at_y = (
         ((c - z * a) / t - c0) / d for c, (a, _, _), t, c0, d in zip((x, y), maps, thinner, (x0, y0), (dx, dy), strict=True)
     )
     n, m = s.padded
     spots = torch.stack([2.0 * at_y[here] / (m - 1) - 1.0, 2.0 * at_x[here] / (n - 1) - 1.0], -1).to(dtype)
-    seen = torch.nn.functional.grid_sample(total[None, None], spots[None, None], mode="bicubic", align_corners=True)[0, 0, 0]
-    return torch.zeros_like(x).masked_scatter(here, seen.double()) / (thinner[0] * thinner[1])
+    seen = torch.nn.functional.grid_sample(power[None], spots[None, None], mode="bicubic", align_corners=True)[0, :, 0]
+    through = (torch.stack([c[here] for c in normal]) * seen.double()).sum(0)
+    return torch.zeros_like(x).masked_scatter(here, through) / (thinner[0] * thinner[1])
 
 
 @torch.no_grad()
