@@ -19,6 +19,7 @@ from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.gradient import index_field_of
 from caustic_cli.optics.gradient.fields import SplineIndex
+from caustic_cli.optics.misalignment import Misalignment, landing_points
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
@@ -26,6 +27,7 @@ from caustic_cli.optics.trace import Tracer, expose, render
 from caustic_cli.project import directory
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.gradient import Gradient
+from caustic_cli.studies.manufacture import manufacture
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.workflow import design as workflow
 
@@ -209,3 +211,18 @@ def test_the_initial_surface_knows_the_gradient(kind, terms):
         image = expose(scene, field, heights, rays_of(scene, "stratified", 400_000, 0)).image.numpy()
         errors.append(relative_rms(image, target))
     assert errors[1] < 2.0 * errors[0] < 0.1  # 3 and 10 for two of them as of a homogeneous lens
+
+
+@pytest.mark.parametrize("gradient", [Gradient("volume", volume=np.full((4, 4, 2), 1.5)), Gradient("radial", (1e-13,))])
+def test_an_even_gradient_is_made_like_a_lens_of_one_index(gradient):
+    """Figures for the workshop, and where light lands with errors, among them of the index."""
+    torch.manual_seed(0)
+    scenes = [scene_of(one, index=1.5) for one in (None, gradient)]
+    heights = flat(scenes[0]) + 1e-2 * torch.rand(scenes[0].lens.control, dtype=torch.float64)
+    made = [manufacture(scene, HeightField.of(scene.lens), heights) for scene in scenes]
+    assert made[0]["landing_mm_per_thousandth_index"] > 1e-4
+    numbers = [{key: value for key, value in one.items() if isinstance(value, float)} for one in made]
+    assert len(numbers[0]) > 12 and numbers[1] == pytest.approx(numbers[0], rel=1e-5, abs=1e-9)
+    errors, rays = Misalignment(index=1e-3, lens_tilt=(0.2, 0.1), thickness=0.05), rays_of(scenes[0], "stratified", 400)
+    one, other = (next(iter(landing_points(scene, HeightField.of(scene.lens), heights, rays, errors))) for scene in scenes)
+    assert float((one.x - other.x).abs().max()) < 1e-6

@@ -114,7 +114,7 @@ class Misalignment:
         Raises:
             InputError: the scene is invalid with these errors.
         """
-        lens = replace(scene.lens, index=scene.lens.index + self.index) if self.index else scene.lens
+        lens = scene.lens.denser(self.index) if self.index else scene.lens
         light = replace(scene.light, wavelengths=tuple((1.0 + self.wavelength) * w for w in scene.light.wavelengths))
         try:
             moved = scene.elements and any((*self.lens_shift, *self.lens_tilt))
@@ -252,8 +252,7 @@ def landing_points(
     with torch.no_grad():
         for band, plain in zip(changed.bands, scene.bands, strict=True):
             if errors.index and band.scene.lens.index == plain.scene.lens.index:  # a glass, by its formula
-                lens = replace(band.scene.lens, index=plain.scene.lens.index + errors.index)
-                band = replace(band, scene=replace(band.scene, lens=lens))
+                band = replace(band, scene=replace(band.scene, lens=band.scene.lens.denser(errors.index)))
             scale = band.weight * errors.brightness(plain.scene, band.scene)
             system = System.of(band.scene, field)
             for state in of_member(rays, band.member).chunks(CHUNK):

@@ -10,7 +10,7 @@ Notation
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,10 @@ class Gradient:
     terms: tuple[float, ...] = ()
     #: (n, m, k) or (n, m) float64 control values.
     volume: np.ndarray | None = None
+
+    def denser(self, by: float) -> Gradient:
+        """The distribution in a lens whose index is larger by this: formulas are relative to that, a volume is not."""
+        return self if self.volume is None else replace(self, volume=self.volume + by)
 
     def __post_init__(self):
         if self.kind == "volume":

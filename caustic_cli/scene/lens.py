@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -249,6 +249,10 @@ class Lens:
     def effective_index(self) -> float:
         """n of the paraxial deflection (n - 1) times the slope: the index, or -1 for a mirror (Snell's law with index -1)."""
         return self.interaction.effective_index(self.index)
+
+    def denser(self, by: float) -> Lens:
+        """The lens with an index that is larger by this everywhere."""
+        return replace(self, index=self.index + by, gradient=None if self.gradient is None else self.gradient.denser(by))
 
     def height_bounds(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the control heights at control points x (n,), y (m,): two (n, m) float64, mm.

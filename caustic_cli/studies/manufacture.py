@@ -22,6 +22,7 @@ from caustic_cli.io.files import SOFTWARE, write_bytes
 from caustic_cli.optics import curvature
 from caustic_cli.optics.bspline import SplineSpace, derivatives_over_grid
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -87,11 +88,12 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     if tool_radius is not None:
         radii = [one["smallest_concave_radius_mm"] for one in (side, found.get("entrance", side))]
         found |= {"tool_radius_mm": tool_radius, "tool_fits": all(radius is None or radius >= tool_radius for radius in radii)}
-    critical, incidence = math.degrees(math.asin(1.0 / lens.index)), _steepest_incidence(scene, field, heights, seed)
+    densest = lens.index * medium_of(lens).variation(lens.half_size, lens.offset.thickness - lens.z_in)[1]
+    critical, incidence = math.degrees(math.asin(1.0 / densest)), _steepest_incidence(scene, field, heights, seed)
     blur = None if scene.unfolded.elements else scene.source.blur(lens.z_in, abs(scene.screen.z - lens.z_in))
     throw = STEP * abs(scene.screen.z)
     by_throw = _moved(scene, scene, field, heights, seed, throw) / throw
-    other = replace(scene, lens=replace(lens, index=lens.index + STEP))
+    other = replace(scene, lens=lens.denser(STEP))
     by_index = _moved(scene, other, field, heights, seed, 0.0) / STEP
     found |= {
         "critical_angle_deg": critical,

@@ -15,9 +15,7 @@ class ManufacturingReport(Output):
     """The figures; tool_radius: of a tool that is to fit in concave regions, mm."""
 
     option: ClassVar[str] = "report"
-    capability: ClassVar[Capability] = Capability(
-        "manufacturing report", {"gradient index": "⟨report⟩ supports lenses of uniform index, and this one has {}"}
-    )
+    capability: ClassVar[Capability] = Capability("manufacturing report", {})
     files: ClassVar[tuple[str, ...]] = ("report.json",)
     beyond: ClassVar[bool] = True
 

@@ -32,9 +32,7 @@ class ToleranceAnalysis(Output):
     """
 
     option: ClassVar[str] = "tolerances"
-    capability: ClassVar[Capability] = Capability(
-        "tolerance analysis", {"gradient index": "⟨tolerances⟩ supports lenses of uniform index, and this one has {}"}
-    )
+    capability: ClassVar[Capability] = Capability("tolerance analysis", {})
     files: ClassVar[tuple[str, ...]] = ("tolerances.csv", "tolerances.png")
     beyond: ClassVar[bool] = True
 
