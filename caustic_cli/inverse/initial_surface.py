@@ -66,6 +66,8 @@ UNREACHED = (
 )
 
 
+#: The scene of an array, and the centre of a lens in it, mm.
+Place = tuple[Scene, tuple[float, float]]
 #: Heights (n, m), mm, at x (n,), y (m,), mm.
 Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -81,20 +83,25 @@ class InitialSurface:
 @dataclass(frozen=True, eq=False)
 class _Grid:
     """Grid of source cells over the lens of a scene, or over its part that is lit, with corners x (n + 1,), y (m + 1,) mm from the
-    middle of that part, which lies at `middle` on the lens, mm; and the target."""
+    middle of that part, which lies at `middle` on the lens, mm; the target; and the array to which the lens belongs, if any."""
 
     whole: Scene
     target: np.ndarray
     x: np.ndarray
     y: np.ndarray
     middle: tuple[float, float] = (0.0, 0.0)
+    array: Place | None = None
 
     @classmethod
-    def of(cls, scene: Scene, target: np.ndarray, cells: int, surface: Surface | None = None) -> _Grid:
+    def of(cls, scene: Scene, target: np.ndarray, cells: int, surface: Surface | None = None, array: Place | None = None) -> _Grid:
         """Cells where light reaches a surface, the offset unless it is given."""
         low, high = lit_rectangle(scene, surface or scene.lens.offset.heights)
         half, middle = ([0.5 * (b + s * a) for a, b in zip(low, high, strict=True)] for s in (-1.0, 1.0))
-        return cls(scene, target, *cell_lines((half[0], half[1]), cells), (middle[0], middle[1]))
+        return cls(scene, target, *cell_lines((half[0], half[1]), cells), (middle[0], middle[1]), array)
+
+    def finer(self, cells: int) -> _Grid:
+        """Cells over the same lens, so many along it."""
+        return _Grid.of(self.whole, self.target, cells, array=self.array)
 
     @cached_property
     def scene(self) -> Scene:
@@ -118,8 +125,11 @@ class _Grid:
         return self.whole.lens.offset.heights(*self.places)
 
     def incident(self, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
-        """`incidence.incident` for heights z at the corners, mm."""
-        return incident(self.whole, *self.places, z)
+        """`incidence.incident` for heights z at the corners, mm; of a lens in an array with the light through its neighbours."""
+        if self.array is None:
+            return incident(self.whole, *self.places, z)
+        scene, at = self.array
+        return incident(scene, *(c + a for c, a in zip(self.places, at, strict=True)), z)
 
     @property
     def floor(self) -> float:
@@ -162,7 +172,7 @@ class _Grid:
         with sharper creases."""
         scene, mean = self.scene, float(found.heights.mean())
         x, y = (corners(times * (len(c) - 1), c[-1]) for c in (self.x, self.y))
-        fine = _Grid(self.whole, self.target, x, y, self.middle)
+        fine = replace(self, x=x, y=y)
         if directions is not None:
             directions = tuple(self.scaled(c, fine) for c in directions)
         projection = self.projection(mean)
@@ -222,7 +232,7 @@ class _Grid:
         reached = 1.0
         for _ in range(passes):
             z = np.maximum(z + middle - _middle(z), self.floor)
-            light, directions = incident(self.scene, self.x, self.y, z)
+            light, directions = self.incident(z)
             for left in range(RETRIES, -1, -1):
                 lit = light * self.above(z) * reached
                 if not lit.max() > 0:
@@ -274,6 +284,7 @@ def first_surface(
     fixed: bool = False,
     seconds: float = math.inf,
     few: int = STANDARD.vertex_cells,
+    array: Place | None = None,
 ) -> InitialSurface:
     """Initial surface for a picture, from light of the centre of the source.
 
@@ -285,6 +296,7 @@ def first_surface(
         fixed: the thickness is given by the user, and no other is tried.
         seconds: approximate time allowed for a near source, which limits its cells.
         few: cells on which the vertex height is chosen for such a source.
+        array: the array that the lens belongs to, from whose source its light comes, and its place there.
 
     Raises:
         InputError: the picture cannot be reached by refraction.
@@ -295,7 +307,7 @@ def first_surface(
     cells = min(cells, SOLVED * times) // times
     if times > 1:
         options = {"tolerance": EXACT, "most": STEPS}
-    grid, lens = _Grid.of(scene, target, cells), scene.lens
+    grid, lens = _Grid.of(scene, target, cells, array=array), scene.lens
     z = grid.offset
     if scene.source.oblique:  # the shadow of the lens' sides depends on the heights
         surface = _rough_surface(scene, target)
@@ -311,7 +323,7 @@ def first_surface(
         if times > 1:
             grid, z = grid.sharper(found, directions, times)
         return InitialSurface(net_of(*grid.places, z, field))
-    found, grid = _near_surface(scene, target, cells, fixed, began + seconds, few, options)
+    found, grid = _near_surface(grid, cells, fixed, began + seconds, few, options)
     z = found.z
     if times > 1:
         grid, z = grid.sharper(found.mapped, found.directions, times)
@@ -320,19 +332,17 @@ def first_surface(
     return InitialSurface(net.clamp_min(grid.floor), found.middle)  # the spline undershoots at a kink
 
 
-def _near_surface(
-    scene: Scene, target: np.ndarray, cells: int, fixed: bool, end: float, few: int, options: dict
-) -> tuple[_TruncatedSurface, _Grid]:
+def _near_surface(grid: _Grid, cells: int, fixed: bool, end: float, few: int, options: dict) -> tuple[_TruncatedSurface, _Grid]:
     """The truncated surface of a near source and its grid, of `cells` cells or so many as the time until `end` permits; options of
     the last transport."""
-    coarse = _Grid.of(scene, target, min(cells, few))
-    found = _best(coarse, scene.lens.offset.thickness, fixed)
+    coarse = grid.finer(min(cells, few))
+    found = _best(coarse, grid.scene.lens.offset.thickness, fixed)
     within = cells
     for most, passes, exactly in ((round(math.sqrt(few * cells)), PASSES - 1, {}), (cells, 1, options)):
         n, started = min(most, within), time.monotonic()
         if n < max(len(coarse.x), len(coarse.y)):
             continue
-        fine = _Grid.of(scene, target, n)
+        fine = grid.finer(n)
         known = coarse.scaled(found.mapped.transport.potential, fine)
         found = fine.truncated(coarse.scaled(found.z, fine), found.middle, passes, known, **exactly)
         coarse, now = fine, time.monotonic()

@@ -8,44 +8,38 @@ Notation
              neighbours share the ones on their border
     h_ij     height offset (piston) of a lenslet, mm
 
-In the frame of lenslet i, j the screen is shifted by -c_ij, and of sources that shine in turn it has its own; all else is the same.
-The landing points of collimated light do not
-depend on a height offset, so the h_ij are chosen to make borders meet: they minimise the sum over all borders of the mean square
-step between the control points on both sides.  The remaining steps, at most `AssembledArray.gap`, are averaged.  The surface may
-have a crease along a border: borders are knots of multiplicity p (`bspline.open_knots`), so that the control points of a lenslet
-affect no other.
+In the frame of lenslet i, j the screen is shifted by -c_ij, as are near sources, and of sources that shine in turn it has its own;
+all else is the same.  Its light is that through its own part of the entrance.  The landing points of collimated light do not depend
+on a height offset, and those of other light hardly, so the h_ij are chosen to make borders meet: they minimise the sum over all
+borders of the mean square step between the control points on both sides.  The remaining steps, at most `AssembledArray.gap`, are
+averaged.  The surface may have a crease along a border: borders are knots of multiplicity p (`bspline.open_knots`), so that the
+control points of a lenslet affect no other.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.incidence import on_entrance
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.mixture import Member, Mixture
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, Source
 from caustic_cli.scene.traits import Capability
 
-NEEDS_DISTANT_SOURCE = (
-    "⟨lens.array⟩ needs light from infinity, which reaches every lenslet alike: ⟨+source.type⟩ plane, or a disc with"
-    " ⟨+source.angle⟩"
-)
-LENSLETS = Capability(
-    "lenslet arrays",
-    {
-        "near source": NEEDS_DISTANT_SOURCE,
-        "laser beam": "⟨lens.array⟩ would give each lenslet a beam of its own",
-        "far field": "⟨lens.array⟩ is designed for a screen at a distance, not for ⟨+throw⟩ inf",
-    },
-)
+LENSLETS = Capability("lenslet arrays", {"laser beam": "⟨lens.array⟩ would give each lenslet a beam of its own"})
+#: Cells along a lenslet by which the light on it is summed.
+CELLS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +47,7 @@ class Lenslet:
     """One lenslet of an array.
 
     scene, field: in its own frame, with its section of the beam; rows, columns: of its control points in the net of the array;
-    share: its fraction of the light on the array.
+    share: its fraction of the light on the array; middle: its centre on that, mm.
     """
 
     scene: Scene
@@ -61,6 +55,7 @@ class Lenslet:
     rows: slice
     columns: slice
     share: float
+    middle: tuple[float, float] = (0.0, 0.0)
 
     def of(self, net: Tensor) -> Tensor:
         """Its section of a control net (n, m) of the array."""
@@ -71,38 +66,47 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
     """The lenslets of a scene's lens, j fastest; control: points of the array's net, the lens' own unless given.
 
     Raises:
-        InputError: light does not come from infinity, or none falls on a lenslet.
+        InputError: no light falls on a lenslet.
     """
     lens, screen = scene.lens, scene.screen
     LENSLETS.refuse(scene)
     steps = [(n - 1) // k for n, k in zip(control or lens.control, lens.array, strict=True)]
     size = (lens.size[0] / lens.array[0], lens.size[1] / lens.array[1])
     own = replace(lens, size=size, control=(steps[0] + 1, steps[1] + 1), array=(1, 1))
-    light, found, hours = _light(scene.source.profile, lens.array), [], scene.source.in_turn
+    found, hours = [], scene.source.in_turn
     for i in range(lens.array[0]):
         for j in range(lens.array[1]):
             middle = [((k + 0.5) / n - 0.5) * w for k, n, w in zip((i, j), lens.array, lens.size, strict=True)]
-            part, source = light[i][j], scene.source.members[i * lens.array[1] + j] if hours else scene.source
-            if not part.sum() > 0:
-                raise InputError(f"⟨source.profile⟩ leaves lenslet {i}, {j} dark; each needs some light")
-            if source.profile is not None:
-                source = replace(source, profile=part)
-            shift = (screen.shift[0] - middle[0], screen.shift[1] - middle[1])
-            alone = replace(scene, source=source, lens=own, screen=replace(screen, shift=shift))
+            source = scene.source.members[i * lens.array[1] + j] if hours else scene.source
+            alone = source.each(lambda one, at=(i, j), middle=middle: _section(one, at, lens.array, middle))
+            pairs = zip(source.fractions, source.members, alone.members, strict=True)
+            share = math.fsum(part * _light_on(scene, one, section, middle, size) for part, one, section in pairs)
+            if not share > 0:
+                raise InputError(f"no light falls on lenslet {i}, {j} (⟨source.profile⟩, ⟨source.cone⟩); each needs some")
+            if not screen.far:
+                screen = replace(screen, shift=tuple(s - m for s, m in zip(scene.screen.shift, middle, strict=True)))
             rows, columns = (slice(k * n, (k + 1) * n + 1) for k, n in zip((i, j), steps, strict=True))
-            found.append(Lenslet(alone, HeightField.of(own), rows, columns, float(part.sum())))
+            placed = replace(scene, source=alone, lens=own, screen=screen)
+            found.append(Lenslet(placed, HeightField.of(own), rows, columns, share, (middle[0], middle[1])))
     total = sum(lenslet.share for lenslet in found)
     return [replace(lenslet, share=lenslet.share / total) for lenslet in found]
 
 
-def _light(profile: np.ndarray | None, array: tuple[int, int]) -> list[list[np.ndarray]]:
-    """Irradiance profile over each lenslet, on a grid of its own, all in the same unit."""
-    if profile is None:
-        return [[np.ones((1, 1))] * array[1]] * array[0]
-    cells = [max(1, -(-n // k)) for n, k in zip(profile.shape, array, strict=True)]
-    (a, b) = cells
-    profile = resampled(profile, (a * array[0], b * array[1]))
-    return [[profile[i * a : (i + 1) * a, j * b : (j + 1) * b] for j in range(array[1])] for i in range(array[0])]
+def _section(source: Source, number: tuple[int, int], array: tuple[int, int], middle: Sequence[float]) -> Source:
+    """A source in the frame of a lenslet: a near one displaced, of a distant one its profile there."""
+    if source.profile is None:
+        return source.displaced(lambda at: (at[0] - middle[0], at[1] - middle[1], at[2]), 1.0)
+    (a, b), (i, j) = (max(1, -(-n // k)) for n, k in zip(source.profile.shape, array, strict=True)), number
+    profile = resampled(source.profile, (a * array[0], b * array[1]))
+    return replace(cast(Any, source), profile=profile[i * a : (i + 1) * a, j * b : (j + 1) * b])
+
+
+def _light_on(scene: Scene, source: Source, section: Source, middle: Sequence[float], size: tuple[float, float]) -> float:
+    """Light of a source, and of its section in the frame of a lenslet, on that, in the same unit for all of an array."""
+    if source.distant:
+        return 1.0 if section.profile is None else float(section.profile.sum())
+    x, y = (m + np.linspace(-0.5, 0.5, CELLS + 1) * w for m, w in zip(middle, size, strict=True))
+    return float(on_entrance(replace(scene, source=source), x, y)[0].sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,11 +153,13 @@ def initial_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[in
     Raises:
         InputError: as of `lenslets` and `first_surface`.
     """
-    parts = lenslets(scene, control)
+    parts, whole = lenslets(scene, control), replace(scene, lens=replace(scene.lens, array=(1, 1)))
     each = targets if len(targets) == len(parts) else [targets[0]] * len(parts)
-    return assemble(
-        [first_surface(one.scene, goal, one.field, cells).heights for one, goal in zip(parts, each, strict=True)], scene.lens.array
-    )
+    nets = []
+    for one, goal in zip(parts, each, strict=True):
+        place = None if scene.source.distant else (whole, one.middle)
+        nets.append(first_surface(one.scene, goal, one.field, cells, fixed=True, array=place).heights)
+    return assemble(nets, scene.lens.array)
 
 
 def array_objective(parts: Sequence[Lenslet], objective: Callable[[int, Lenslet], LossOfHeights]) -> Mixture:

@@ -15,7 +15,7 @@ from caustic_cli.config.exclusions import refuse_excluded
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import InitialSurface
-from caustic_cli.inverse.lenslets import NEEDS_DISTANT_SOURCE, array_objective, initial_array, lenslets
+from caustic_cli.inverse.lenslets import array_objective, initial_array, lenslets
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.target import grey
 from caustic_cli.kinds.defaults import Defaults
@@ -48,8 +48,6 @@ class LensletArray(OneSurface):
     def refuse_settings(cls, d: Defaults) -> None:
         super().refuse_settings(d)
         refuse_excluded("lens.array", d.s)
-        if d.design.start == "transport" and not d.source.distant:
-            raise InputError(NEEDS_DISTANT_SOURCE)
 
     @classmethod
     def fine_net(cls, d: Defaults) -> bool:

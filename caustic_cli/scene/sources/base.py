@@ -211,6 +211,10 @@ class Source:
         """Whether it has a size."""
         return False
 
+    def each(self, change: Callable[[Source], Source]) -> Source:
+        """The source with each of its members changed."""
+        return change(self)
+
     def displaced(
         self,
         place: Callable[[Sequence[float]], tuple[float, float, float]],

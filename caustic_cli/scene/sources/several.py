@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -100,6 +100,10 @@ class Several(Source):
     def half_angle(self) -> float:
         """The largest."""
         return max(member.half_angle for member in self.members)
+
+    def each(self, change: Callable[[Source], Source]) -> Source:
+        """As of a source, of each."""
+        return replace(self, members=tuple(change(member) for member in self.members))
 
     def batch(self, k: int, of: int) -> Source:
         """As of a source, of each."""
