@@ -49,8 +49,9 @@ from caustic_cli.scene.materials import nearest_index
 NM = 1e-6
 #: Transform samples per second on two cores; largest number of samples of a wave image that was not requested explicitly.
 A_SECOND, UNASKED = 1e8, 120e8
-#: Most samples of a transform that is computed whole, with about 50 bytes each; others are by blocks.
-WHOLE = 1 << 24
+#: Most samples of a transform that is computed whole, with about 50 bytes each; others are by blocks, of which one sample takes as
+#: long as so many (22,000 x 22,000: 26 s).
+WHOLE, BY_BLOCKS = 1 << 24, 5.0
 #: Least number of samples of the field per knot span of the finest surface: its finest structure sends light aside, which would
 #: otherwise be aliased into the picture.
 SAMPLES_A_SPAN = 2
@@ -212,10 +213,11 @@ def image_of(
                 light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=perturbation is not None
             )
             imager = replace(imager, perturbation=perturbation)
-            if (samples := imager.sampling.samples * len(light) * len(imager.modes(light[0].system))) > most:
+            each = imager.sampling.samples * (1.0 if imager.sampling.samples <= WHOLE else BY_BLOCKS)
+            if (samples := each * len(light) * len(imager.modes(light[0].system))) > most:
                 raise NoWaveImage(
-                    f"a wave image of this scene takes {samples:.2g} samples, about {samples / A_SECOND / 60:.0f} minutes on two"
-                    " cores; the effect diffraction, requested by name, computes it"
+                    f"a wave image of this scene takes about {samples / A_SECOND / 60:.0f} minutes on two cores; the effect"
+                    " diffraction, requested by name, computes it"
                 )
             found.append(imager.expose(light, parameters, dtype))
     return (

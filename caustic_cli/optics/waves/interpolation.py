@@ -12,7 +12,7 @@ from torch import Tensor
 #: Stencil points of the interpolation along an axis.
 POINTS = 6
 #: Fine rows that are computed at a time.
-BLOCK = 256
+BLOCK = 64
 
 
 def lagrange_weights(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):

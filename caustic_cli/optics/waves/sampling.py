@@ -27,9 +27,7 @@ BEYOND, FINER, LEAST = 1.06, 1.08, 128
 A_PIXEL = 6.0
 #: Largest number of samples along an axis; memory of a piece of a transform: least limit in bytes, and limit relative to free
 #: memory.
-MOST, PIECE, OF_FREE = 1 << 17, 1 << 30, 0.3
-#: Copies of a piece in memory.
-COPIES = 2
+MOST, PIECE, OF_FREE = 1 << 17, 1 << 30, 0.5
 
 
 #: A count, or a length.
@@ -106,7 +104,7 @@ class Sampling:
 
     def pieces(self, wide: int) -> int:
         """Number of pieces of a transform computed by blocks, of numbers of `wide` bytes, that fit into memory."""
-        return min(self.padded[1], math.ceil(COPIES * wide * self.count[0] * self.padded[1] / max(PIECE, OF_FREE * memory_free())))
+        return min(self.padded[1], math.ceil(wide * self.count[0] * self.padded[1] / max(PIECE, OF_FREE * memory_free())))
 
     @property
     def samples(self) -> int:
