@@ -37,7 +37,15 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, Source
 from caustic_cli.scene.traits import Capability
 
-LENSLETS = Capability("lenslet arrays", {"laser beam": "⟨lens.array⟩ would give each lenslet a beam of its own"})
+LENSLETS = Capability(
+    "lenslet arrays",
+    {
+        "laser beam": "⟨lens.array⟩ would give each lenslet a beam of its own",
+        **dict.fromkeys(
+            ("ray file", "ray file among sources"), "⟨lens.array⟩ does not divide the rays of a file among its lenslets"
+        ),
+    },
+)
 #: Cells along a lenslet by which the light on it is summed.
 CELLS = 16
 
