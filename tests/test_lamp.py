@@ -471,6 +471,22 @@ def test_the_loss_is_differentiable_to_second_order_remainders(chip):
     assert 1.7 < np.polyfit(np.log(steps), np.log(remainders), 1)[0] < 2.3
 
 
+@pytest.mark.parametrize("chip", [Chip(), Chip("disc", (2.0, 2.0))])
+def test_the_loss_is_the_same_in_any_number_of_threads(chip, monkeypatch):
+    monkeypatch.setattr("caustic_cli.optics.lamp.CHUNK", 1000)
+    field, goal = PolarField.uniform((10, 10)), Goal((120.0, 120.0))
+    found = []
+    for threads in (1, 3):
+        objective = LampObjective(Lamp(chip), goal, field, wanted(goal, np.ones((2, 2)), (8, 8)), 3000, threads=threads)
+        assert len(objective.rays) > 2
+        start = bumpy(field, seed=4).requires_grad_()
+        loss = objective(start)
+        found.append((float(loss.detach()), torch.autograd.grad(loss, start)[0]))
+        with torch.no_grad():
+            assert float(objective(start)) == found[-1][0]
+    assert found[0][0] == found[1][0] and torch.equal(found[0][1], found[1][1])
+
+
 # Design
 
 

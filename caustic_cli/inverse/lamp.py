@@ -14,12 +14,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from caustic_cli.effort import STANDARD, Effort
 from caustic_cli.errors import InputError
@@ -96,6 +99,36 @@ def coarse(image: Tensor) -> Tensor:
     return image.view(n // FINER, FINER, m // FINER, FINER).sum((1, 3))
 
 
+class _InThreads(torch.autograd.Function):
+    """A function of values for several parts, each in a thread of a pool; outputs of all parts one after the other.
+
+    The tensors of a part are too small for the threads of one operation.
+    """
+
+    @staticmethod
+    def forward(ctx, values: Tensor, function: Callable[[Any, Tensor], tuple[Tensor, ...]], parts: Sequence[Any], pool: Executor):
+        def one(part: Any) -> tuple[Tensor, tuple[Tensor, ...]]:
+            with torch.set_grad_enabled(wanted):
+                leaf = values.detach().requires_grad_(wanted)
+                return leaf, function(part, leaf)
+
+        wanted = ctx.needs_input_grad[0]
+        ctx.done, ctx.pool = list(pool.map(one, parts)), pool
+        return tuple(c.detach() for _, found in ctx.done for c in found)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *given):
+        each = len(given) // len(ctx.done)
+
+        def one(k: int) -> Tensor:
+            leaf, found = ctx.done[k]
+            pairs = [(c, g) for c, g in zip(found, given[k * each : (k + 1) * each], strict=True) if c.requires_grad]
+            return torch.autograd.grad([c for c, _ in pairs], leaf, [g for _, g in pairs])[0]
+
+        return sum(ctx.pool.map(one, range(len(ctx.done)))), None, None, None
+
+
 class LampObjective:
     """The loss of control values, (n, m) or (2, n, m) (`optics.lamp.sides`), for fixed rays: of a point those of a grid, of a
     chip those of grids from several of its points.
@@ -105,13 +138,15 @@ class LampObjective:
         rays: about.
         weight: w, see the module; of a chip for a blur as wide as the border, and in proportion to it, since the light at stake at
             the edges is.
+        threads: in which parts of the rays are traced.
     """
 
-    def __init__(self, lamp: Lamp, goal: Goal, field: PolarField, target: Tensor, rays: int, weight: float = 0.1):
+    def __init__(self, lamp: Lamp, goal: Goal, field: PolarField, target: Tensor, rays: int, weight: float = 0.1, threads: int = 1):
         point, shape = lamp.chip.shape == "point", (target.shape[0], target.shape[1])
         self.goal, self.weight = goal, weight if point else weight * lamp.blur(goal) / lamp.border(goal)
         self.rays: Sequence[PointGrid | ChipRays]
         self.rays = PointGrid.of(field, rays, lamp.chip) if point else list(chip_grids(lamp.chip, CHIP_POINTS, rays))
+        self.pool = ThreadPoolExecutor(threads)
         self.through = partial(through_point if point else through, lamp, field)
         apron = FINER * APRON
         self.screen = Screen(goal.size, resolution=shape).grown((apron, apron))
@@ -138,19 +173,23 @@ class LampObjective:
 
     def terms(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """rho^2, efficiency, mean distance beside the target, and lack of margin."""
-        image, distance, lack = (sum(part) for part in zip(*(self._see(rays, values) for rays in self.rays), strict=True))
+        found = _InThreads.apply(values, self._see, self.rays, self.pool)
+        image, distance, lack = torch.zeros_like(self.target), sum(found[3::5]), sum(found[4::5])
+        for x, y, power in zip(found[::5], found[1::5], found[2::5], strict=True):
+            image = image + self.splat(x, y, power, self.screen, FILTER)[0]
         residual = self.over(image / (image * self.seen).sum() - self.target)
         return (self.weights * residual**2).sum(), (image * self.inside).sum(), distance, lack
 
-    def _see(self, rays, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Contributions of some rays to the image, to the distance beside the target and to the lack of margin."""
+    def _see(self, rays, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Where some rays land, x, y, mm, and with what power, and their contributions to the distance beside the target and to the
+        lack of margin."""
         light = self.through(rays, values)
         x, y, ahead = land(self.goal, light)
-        image, _ = self.splat(x, y, torch.where(ahead, light.power, torch.zeros_like(x)), self.screen, FILTER)
         beside = [(c.abs() / (0.5 * s) - 1.0).clamp_min(0.0) for c, s in zip((x, y), self.goal.size, strict=True)]
         distance = beside[0] + beside[1]
         lack = (1.0 - light.spare / MARGIN).clamp_min(0.0)
-        return image, (light.power * (distance / (1.0 + distance))).sum(), (rays.power * lack).sum()
+        power = torch.where(ahead, light.power, torch.zeros_like(x))
+        return x, y, power, (light.power * (distance / (1.0 + distance))).sum(), (rays.power * lack).sum()
 
     def __call__(self, values: Tensor) -> Tensor:
         square, efficiency, distance, lack = self.terms(values)
@@ -363,6 +402,7 @@ def design_lamp(
     begun: tuple[int, PolarField, Tensor] | None = None,
     on_iteration: Callable[[int, int, float], None] = lambda stage, k, loss: None,
     on_stage: Callable[[int, PolarField, Tensor], None] = lambda done, field, values: None,
+    threads: int = 1,
 ) -> Tensor:
     """The surfaces that send the light of a chip to a picture: control values of r, mm, over the spline spaces `final_field`,
     (n, m) of one or (2, n, m) of two (`optics.lamp.sides`).
@@ -372,6 +412,7 @@ def design_lamp(
         begun: number of stages that were done before, and the spline spaces and control values after them.
         on_iteration: called with the number of the stage, that of iterations in it and the loss.
         on_stage: called with the number of stages that are done, and the spline spaces and control values.
+        threads: as of `LampObjective`.
 
     Raises:
         InputError: the picture is black, or the surfaces come too near to each other.
@@ -390,7 +431,7 @@ def design_lamp(
             values = torch.stack([field.sphere(BEGIN * lamp.inner), values])
         across, along = pixels_of(goal, pixels)
         target = wanted(goal, picture, (FINER * across, FINER * along))
-        objective = LampObjective(designed, goal, field, target, rays, weight)
+        objective = LampObjective(designed, goal, field, target, rays, weight, threads)
         values = refine(objective, values, iterations, partial(on_iteration, k))
         on_stage(k + 1, field, values)
     if lamp.surfaces == 1 and lamp.flat is None:  # the light of one that is a little smaller is the same

@@ -247,9 +247,10 @@ def _run(project: Project, before: Checkpoint | None, force: bool, say: Reporter
         before = saved
 
     with project.hold:
-        with say.progress(total) as show, one_thread():  # the tensors of a chunk of rays are too small for more threads
+        threads = torch.get_num_threads()
+        with say.progress(total) as show, one_thread():  # each of those that trace a part of the rays
             begun = None if before is None else (before.state.stage, PolarField(before.spaces), before.state.heights)
-            how: dict[str, Any] = {"effort": effort, "begun": begun}
+            how: dict[str, Any] = {"effort": effort, "begun": begun, "threads": threads}
             values = design_lamp(lamp, goal, picture, **how, on_iteration=told, on_stage=save)
         found = LampDesign(project, lamp, goal, final_field(lamp, effort), values, picture, {})
         evaluation = found.evaluated(None, s.design.seed)
