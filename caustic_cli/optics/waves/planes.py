@@ -37,26 +37,10 @@ def power_by_planes(r: Receiver, s: Sampling, front: Wavefront, length: float, b
     Raises:
         NoWaveImage: too many planes are needed.
     """
-    plane = r.plane
     device = front.path.device
     if not bool((front.density > 0).any()):  # no light lands near the screen
         return torch.zeros(r.resolution, dtype=torch.float64, device=device)
-    u, v = (
-        r.low[k] + r.pixel[k] * (torch.arange(A_PIXEL * r.resolution[k], dtype=torch.float64, device=device) + 0.5) / A_PIXEL
-        for k in (0, 1)
-    )
-    u, v = (c.expand(len(u), len(v)) for c in (u[:, None], v[None, :]))
-    sag, *slopes = (torch.from_numpy(c).to(device) for c in r.shape.at(u.cpu().numpy(), v.cpu().numpy()))
-
-    def turned(vector: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """From the screen's frame to the plane's."""
-        return tuple(torch.stack([dot(a, e) * c for a, c in zip(r.axes, vector, strict=True)]).sum(0) for e in plane.axes)
-
-    x, y, z = (c + dot(r.middle, e) for c, e in zip(turned((u, v, sag)), plane.axes, strict=True))
-    z = z - plane.z  # above the plane through the screen's centre
-    facing = math.copysign(1.0, dot(r.axes[2], plane.axes[2]))
-    normal = turned((-facing * slopes[0], -facing * slopes[1], torch.full_like(sag, facing)))
-
+    (x, y, z), normal = _samples(r, device)
     path, root, lit = front.on(s.low, s.step, s.count).rows()
     amplitude = root * lit
     foot = [s.low[k] + s.step[k] * (torch.arange(s.count[k], dtype=torch.float64, device=device) + 0.5) for k in (0, 1)]
@@ -93,6 +77,26 @@ def power_by_planes(r: Receiver, s: Sampling, front: Wavefront, length: float, b
     cell = r.pixel[0] * r.pixel[1] / A_PIXEL**2
     n, m = r.resolution
     return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell
+
+
+def _samples(r: Receiver, device: torch.device) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Sample points of a screen's pixels, from its `Receiver.plane` and in the frame of that, mm, and normals as in the module's
+    notation; three components each, of all samples along x and y."""
+    plane = r.plane
+    lines = [
+        r.low[k] + r.pixel[k] * (torch.arange(A_PIXEL * r.resolution[k], dtype=torch.float64, device=device) + 0.5) / A_PIXEL
+        for k in (0, 1)
+    ]
+    u, v = torch.meshgrid(*lines, indexing="ij")
+    sag, *slopes = (torch.from_numpy(c).to(device) for c in r.shape.at(u.cpu().numpy(), v.cpu().numpy()))
+
+    def turned(vector: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """From the screen's frame to the plane's."""
+        return tuple(torch.stack([dot(a, e) * c for a, c in zip(r.axes, vector, strict=True)]).sum(0) for e in plane.axes)
+
+    x, y, z = (c + dot(r.middle, e) for c, e in zip(turned((u, v, sag)), plane.axes, strict=True))
+    facing = math.copysign(1.0, dot(r.axes[2], plane.axes[2]))
+    return (x, y, z - plane.z), turned((-facing * slopes[0], -facing * slopes[1], torch.full_like(sag, facing)))
 
 
 class PlanesExposure:
