@@ -39,6 +39,9 @@ from caustic_cli.scene.screen import Window, passed_by
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.several import Several
 
+#: Effects that light along the axis alone does without, of which it may be proved in the nominal scene.
+NOMINAL = frozenset({"entrance"})
+
 
 @dataclass(frozen=True)
 class Misalignment:
@@ -246,7 +249,7 @@ def landing_points(
         rays: sampled for `errors.scene(scene)`.
         requests: of the plan of the nominal scene.
     """
-    changed = errors.scene(scene)
+    changed, requests = errors.scene(scene), replace(requests, off=requests.off - NOMINAL)
     (point, axes), shape, windows = errors.screen(scene), shape_of(scene.screen), errors.windows(scene)
     parameters = {EXIT: heights + errors.thickness}
     with torch.no_grad():
