@@ -39,9 +39,6 @@ from caustic_cli.scene.screen import Window, passed_by
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.several import Several
 
-#: Effects that light along the axis alone does without, of which it may be proved in the nominal scene.
-NOMINAL = frozenset({"entrance"})
-
 
 @dataclass(frozen=True)
 class Misalignment:
@@ -247,9 +244,9 @@ def landing_points(
     Args:
         heights: (n, m) mm, of the surface as manufactured; the thickness error is added here.
         rays: sampled for `errors.scene(scene)`.
-        requests: of the plan of the nominal scene.
+        requests: of the plan of the nominal scene, whose proofs that an effect may be left out do not hold with errors.
     """
-    changed, requests = errors.scene(scene), replace(requests, off=requests.off - NOMINAL)
+    changed, requests = errors.scene(scene), replace(requests, off=frozenset())
     (point, axes), shape, windows = errors.screen(scene), shape_of(scene.screen), errors.windows(scene)
     parameters = {EXIT: heights + errors.thickness}
     with torch.no_grad():
