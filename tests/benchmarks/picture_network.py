@@ -60,8 +60,6 @@ DARK, SECONDS = 0.05, 20.0
 BEGIN, POOL = (0.0, 0.12, 0.3), 16
 #: Times that each start is computed, of whose seconds the median counts.
 ROUNDS = 3
-#: Points along the lens at which its map is examined for folds.
-MAP_POINTS = 512
 #: Shapes of a picture of dead leaves, and lines of one of strokes.
 LEAVES, LINES = 40, 10
 
@@ -356,14 +354,14 @@ def heights_of(basis: Basis, psi: Tensor, problem: Problem) -> Tensor:
     return net_of(at, at, z, problem.field(0))
 
 
-def compare(file: Path, pictures: dict[str, Path], iterations: list[int], rays: int) -> None:
-    """Print a Markdown table: processor seconds of each start, the part of the lens on which it is folded, errors of designs from
-    it after these iterations, and processor seconds of start and iterations."""
+def compare(file: Path, pictures: dict[str, Path], iterations: list[int], rays: int, preconditioner: str) -> None:
+    """Print a Markdown table: processor seconds of each start, errors of designs from it after these iterations, the light beside
+    the screen or in black before and after them, and processor seconds of start and iterations."""
     torch.set_num_threads(1)
     n = LEVELS[-1]
     said = {"mag": 1.0, "margin": 0.0, "screen.resolution": [n, n], "lens.control": [2 * n + 3] * 2, "design.waves": "off"}
     print(f"the network: {file.stat().st_size / 1e6:.1f} MB\n")
-    print(f"| picture | start | its seconds | folded | {' | '.join(f'after {k}' for k in iterations)} | seconds in all |")
+    print(f"| picture | start | its seconds | {' | '.join(f'after {k}' for k in iterations)} | light astray | seconds in all |")
     print("| --- " * (len(iterations) + 5) + "|", flush=True)
     ways = {
         "transport": lambda p: p.transport(True, math.inf).heights,
@@ -373,43 +371,35 @@ def compare(file: Path, pictures: dict[str, Path], iterations: list[int], rays: 
     }
     for name, picture in pictures.items():
         for way, start in ways.items():
-            problem = prepare(
-                picture, said | {"design.start": "offset" if way == "offset" else "transport"}, say=Listener()
-            ).problem
+            begins = {"start": "offset"} if way == "offset" else {"start": "transport", "preconditioner": preconditioner}
+            given = said | {f"design.{key}": value for key, value in begins.items()}
+            problem = prepare(picture, given, say=Listener()).problem
             took = []
             for _ in range(ROUNDS):
                 began = time.process_time()
                 first = start(problem)
                 took.append(time.process_time() - began)
-            errors, seconds = refined(problem, first, iterations, rays)
-            spent, part = statistics.median(took), 0.0 if first is None else folded(problem, first)
-            print(f"| {name} | {way} | {spent:.2f} | {part:.2%} | {' | '.join(errors)} | {spent + seconds:.1f} |", flush=True)
+            errors, astray, seconds = refined(problem, first, iterations, rays)
+            spent, light = statistics.median(took), f"{astray[0]:.2%} to {astray[-1]:.2%}"
+            print(f"| {name} | {way} | {spent:.2f} | {' | '.join(errors)} | {light} | {spent + seconds:.1f} |", flush=True)
 
 
-def folded(problem: Problem, net: Tensor) -> float:
-    """Part of the lens where neighbouring light lands in the reverse order, to first order in the angles: the Jacobian of the map
-    1 + (index - 1) throw H, H of the second derivatives of the heights, is negative."""
-    lens, count = problem.scene.lens, MAP_POINTS
-    lines = [((torch.arange(count, dtype=torch.float64) + 0.5) / count * 2.0 - 1.0) * half for half in lens.half_size]
-    x, y = (c.reshape(-1) for c in torch.meshgrid(*lines, indexing="ij"))
-    gain = (lens.effective_index - 1.0) * (problem.scene.screen.z - float(net.mean()))
-    xx, yy, xy = (gain * h for h in problem.field(0).at(net, x, y, ((2, 0), (0, 2), (1, 1))))
-    return float(((1.0 + xx) * (1.0 + yy) - xy * xy < 0.0).double().mean())
-
-
-def refined(problem: Problem, first: Tensor | None, iterations: list[int], rays: int) -> tuple[list[str], float]:
-    """Errors of a design after these iterations, with their noise, and its processor seconds without the start."""
+def refined(problem: Problem, first: Tensor | None, iterations: list[int], rays: int) -> tuple[list[str], list[float], float]:
+    """Errors of a design after these iterations, with their noise; the parts of its light that land beside the screen or in black;
+    and its processor seconds without the start."""
     designer = Designer(problem.varied([replace(s, tolerance=0.0) for s in problem.stages], problem.options))
     initial = designer.initial_heights(first)
-    state, found, seconds = designer.initial_state(None if initial is None else initial.heights), [], 0.0
+    state, seconds = designer.initial_state(None if initial is None else initial.heights), 0.0
+    errors, astray = [], []
     for count in iterations:
         if count:
             began = time.process_time()
             state = designer.run(state, iterations=count)
             seconds += time.process_time() - began
         _, said = retrace(problem.scene, designer.field(state.stage), state.heights, problem.target.numpy(), rays=rays, seed=1)
-        found.append(f"{said['relative_rms']:.4f} ± {said['noise']:.4f}")
-    return found, seconds
+        errors.append(f"{said['relative_rms']:.4f} ± {said['noise']:.4f}")
+        astray.append(1.0 - said["on_screen"] * (1.0 - (said["in_black"] or 0.0)) / (1.0 - said["lost"]["fresnel"]))
+    return errors, astray, seconds
 
 
 def main() -> None:
@@ -420,11 +410,12 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--batch", type=int, default=48)
-    parser.add_argument("--rate", type=float, default=1e-3)
+    parser.add_argument("--rate", type=float, default=2e-3)
     parser.add_argument("--levels", default=",".join(map(str, LEVELS)))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pictures", default="flame,ball,portrait,tophat,house")
     parser.add_argument("--iterations", default="0,20,60,150")
+    parser.add_argument("--preconditioner", default="none", choices=("none", "laplacian"), help="of the designs from a surface")
     parser.add_argument("--rays", type=int, default=4_000_000, help="of those who judge")
     options = parser.parse_args()
     if options.train:
@@ -437,7 +428,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         files = known(Path(folder)) | {name: EXAMPLES / f"{name}.png" for name in ("tophat", "house")}
         chosen = {name: files[name] for name in options.pictures.split(",")}
-        compare(options.compare, chosen, [int(n) for n in options.iterations.split(",")], options.rays)
+        compare(options.compare, chosen, [int(n) for n in options.iterations.split(",")], options.rays, options.preconditioner)
 
 
 if __name__ == "__main__":
