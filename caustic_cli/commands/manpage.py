@@ -177,6 +177,10 @@ as_designed_error and legible_error, the bounds; film, plot.
 For a sundial: relative_rms of all light on the screen at the time of each lenslet against its picture, and contrast, of its own
 light to that of the others on the bright part of the picture; in the order of the lenslets. hours_image: all images as a sheet.
 .TP
+.B stray
+For an array with a source behind every lenslet: the fraction of the light on the screen that has not passed the lenslet of its own
+source.
+.TP
 .B want
 For an array with a prescribed illumination: brightness of each lenslet's source relative to the largest, N lists of M; error, the
 relative RMS error of the resulting image; kkt_residual; power, as a fraction of what all sources would require; image.

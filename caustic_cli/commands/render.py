@@ -191,7 +191,8 @@ class OutputOptions(options.Given):
         typer.Option(
             metavar="PICTURE",
             help="For a lenslet array: the source brightness of each lenslet that gives this illumination (non-negative least"
-            " squares over the images of the single lenslets); writes wanted.png beside the image.",
+            " squares over the images of the single lenslets, of their sources through the whole array with --source-each); writes"
+            " wanted.png beside the image.",
         ),
     ] = None
 

@@ -87,7 +87,7 @@ def stage_of(table: Mapping[str, Any], settings: Settings) -> Stage:
         LossImage(filter, t.blur, t.apron, t.oversample, settings.design.filter_target, region_of(settings.design)),
         t.iterations,
         t.tolerance,
-        None if t.source is None else build_source(settings.source, type=t.source),
+        None if t.source is None else build_source(settings.source, t.source, settings.lens),
         t.waves or (),
         t.spread,
         t.lenslets,

@@ -38,6 +38,7 @@ _SECOND = (("second.file", "second.collimate", "second.focus"), ("second.collima
 EXCLUDED: dict[str, dict[str, str]] = {
     "target.sheet": {"target.color": _SHEET},
     "target.color": {
+        "source.each": "⟨source.each⟩ is not for a coloured picture",
         "source.also": "[[source]] of a coloured picture must be one, whose three wavelengths are its colours",
         "source.spectrum": "⟨source.spectrum⟩ is not for a coloured picture, whose three wavelengths are its colours",
     },
@@ -61,6 +62,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
         ),
         "design.waves on": "⟨design.waves⟩ on refines heights, but ⟨lens.gradient⟩ free designs the index, by rays",
     },
+    "source.each": {"source.also": "⟨source.each⟩ needs one [[source]], of which there is one behind every lenslet"},
     "source.tilt": {
         **dict.fromkeys(
             (*TRAITS["two sides"].settings, "lens.gradient free", "element", "design.over"),
@@ -73,6 +75,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
 #: Feature -> settings of which it needs one -> message.
 NEEDED: dict[str, tuple[tuple[str, ...], str]] = {
     "target.sheet": (("lens.array",), _SHEET),
+    "source.each": (("lens.array",), "⟨source.each⟩ needs ⟨+lens.array⟩, for each of whose lenslets there is a source"),
     "second.file": (("second.z",), "⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen"),
     **{
         feature: (TRAITS["two sides"].settings, f"⟨{feature}⟩ belongs to ⟨+second.file⟩, which is not given")

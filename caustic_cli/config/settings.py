@@ -24,7 +24,9 @@ from caustic_cli.errors import InputError, alternatives, near
 from caustic_cli.io.files import read_bytes
 from caustic_cli.loading import OnDemand
 from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
+from caustic_cli.scene.aperture import Aperture, Pupil
 from caustic_cli.scene.gradient import KINDS, Gradient
+from caustic_cli.scene.lens import lenslet_centres
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import PLANE, Sags
 from caustic_cli.scene.sources.plane import GRAZING
@@ -84,7 +86,7 @@ SCHEMA = _schema()
 STAGE, ELEMENT = in_section("design.stages"), in_section("element")
 #: Keys that hold tables: their heading in the file, and their keys.  Sources after the first are stored in [source] also; keys in
 #: FIRST belong to the first source only.
-FIRST = ("polarisation", "profile", "power_unit")
+FIRST = ("polarisation", "profile", "power_unit", "each")
 TABLES = {
     ("design", "stages"): ("design.stages", STAGE),
     ("element", "list"): ("element", ELEMENT),
@@ -429,10 +431,13 @@ def build_gradient(lens: LensSettings) -> Gradient | None:
     return None if values is None else Gradient("volume", (), values)
 
 
-def build_source(source: SourceSettings, type: str | None = None) -> Source:
-    """The source of the [source] section, or the same with another `type`.
+def build_source(source: SourceSettings, type: str | None = None, lens: LensSettings | None = None) -> Source:
+    """The source of the [source] section, or the same with another `type`; lens: behind whose lenslets each stands, if it does.
 
     Keys that the type does not use are ignored, so that stages can change the type.
+
+    Raises:
+        InputError: a value is out of range, or such a source cannot stand behind each lenslet.
     """
     made, lit = sources.type_of(type or source.type), sources.used_by("profile")
     check("source.power", source.power)  # before it is distributed to points
@@ -440,6 +445,12 @@ def build_source(source: SourceSettings, type: str | None = None) -> Source:
         raise InputError(f"⟨source.profile⟩ belongs to type {alternatives(lit)}, got type {source.type}")
     profile = content(source, "profile", np.ndarray)
     one = made.from_settings(source, profile)
+    if source.each and lens is not None:
+        if lens.mirror:
+            raise InputError("⟨source.each⟩ is for lenses: behind the lenslets of a mirror, sources would stand in its light")
+        pupil = Pupil(Aperture((lens.size[0] / 2.0, lens.size[1] / 2.0)), lens.z_in)
+        centres, (light,) = lenslet_centres(lens.array, lens.size), sources.several.lights_of(source)
+        return sources.several.behind_lenslets(one, light, centres, pupil)
     return one if type is not None else sources.combined(one, source)
 
 
@@ -455,7 +466,7 @@ def build_scene(settings: Settings) -> Scene:
             " and export take it, and no other command"
         )
     return Scene(
-        build_source(settings.source),
+        build_source(settings.source, lens=settings.lens),
         build_lens(settings.lens),
         build_screen(settings.screen),
         build_light(settings),

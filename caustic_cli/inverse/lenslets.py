@@ -8,12 +8,12 @@ Notation
              neighbours share the ones on their border
     h_ij     height offset (piston) of a lenslet, mm
 
-In the frame of lenslet i, j the screen is shifted by -c_ij, as are near sources, and of sources that shine in turn it has its own;
-all else is the same.  Its light is that through its own part of the entrance.  The landing points of collimated light do not depend
-on a height offset, and those of other light hardly, so the h_ij are chosen to make borders meet: they minimise the sum over all
-borders of the mean square step between the control points on both sides.  The remaining steps, at most `AssembledArray.gap`, are
-averaged.  The surface may have a crease along a border: borders are knots of multiplicity p (`bspline.open_knots`), so that the
-control points of a lenslet affect no other.
+In the frame of lenslet i, j the screen is shifted by -c_ij, as are near sources, and of sources that are each for a lenslet it has
+its own; all else is the same.  Its light is that through its own part of the entrance.  The landing points of collimated light do
+not depend on a height offset, and those of other light hardly, so the h_ij are chosen to make borders meet: they minimise the sum
+over all borders of the mean square step between the control points on both sides.  The remaining steps, at most
+`AssembledArray.gap`, are averaged.  The surface may have a crease along a border: borders are knots of multiplicity p
+(`bspline.open_knots`), so that the control points of a lenslet affect no other.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, Source
+from caustic_cli.scene.lens import lenslet_centres
 from caustic_cli.scene.traits import Capability
 
 LENSLETS = Capability(
@@ -81,11 +82,12 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
     steps = [(n - 1) // k for n, k in zip(control or lens.control, lens.array, strict=True)]
     size = (lens.size[0] / lens.array[0], lens.size[1] / lens.array[1])
     own = replace(lens, size=size, control=(steps[0] + 1, steps[1] + 1), array=(1, 1))
-    found, hours = [], scene.source.in_turn
+    found, centres = [], lenslet_centres(lens.array, lens.size)
     for i in range(lens.array[0]):
         for j in range(lens.array[1]):
-            middle = [((k + 0.5) / n - 0.5) * w for k, n, w in zip((i, j), lens.array, lens.size, strict=True)]
-            source = scene.source.members[i * lens.array[1] + j] if hours else scene.source
+            number = i * lens.array[1] + j
+            middle = centres[number]
+            source = scene.source.members[number] if scene.source.by_lenslet else scene.source
             alone = source.each(lambda one, at=(i, j), middle=middle: _section(one, at, lens.array, middle))
             pairs = zip(source.fractions, source.members, alone.members, strict=True)
             share = math.fsum(part * _light_on(scene, one, section, middle, size) for part, one, section in pairs)
@@ -95,7 +97,7 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
                 screen = replace(screen, shift=tuple(s - m for s, m in zip(scene.screen.shift, middle, strict=True)))
             rows, columns = (slice(k * n, (k + 1) * n + 1) for k, n in zip((i, j), steps, strict=True))
             placed = replace(scene, source=alone, lens=own, screen=screen)
-            found.append(Lenslet(placed, HeightField.of(own), rows, columns, share, (middle[0], middle[1])))
+            found.append(Lenslet(placed, HeightField.of(own), rows, columns, share, middle))
     total = sum(lenslet.share for lenslet in found)
     return [replace(lenslet, share=lenslet.share / total) for lenslet in found]
 
@@ -165,7 +167,7 @@ def initial_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[in
     each = targets if len(targets) == len(parts) else [targets[0]] * len(parts)
     nets = []
     for one, goal in zip(parts, each, strict=True):
-        place = None if scene.source.distant else (whole, one.middle)
+        place = None if scene.source.distant or scene.source.by_lenslet else (whole, one.middle)
         nets.append(first_surface(one.scene, goal, one.field, cells, fixed=True, array=place).heights)
     return assemble(nets, scene.lens.array)
 

@@ -83,7 +83,7 @@ class LensletArray(OneSurface):
     @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
         stages = cls.refinement(d, cls.creased(d, waves))
-        if d.s.target.sheet:
+        if d.s.target.sheet or d.s.source.each:  # of rays over the whole array few would meet the lenslet of their source
             stages = each_lenslet(stages, math.prod(d.lens.array), d.resolution)
         return stages
 

@@ -175,7 +175,7 @@ class OneSurface(Problem):
     @classmethod
     def default_start(cls, d: Defaults) -> str:
         """The initial surface unless one is given."""
-        return "transport" if d.from_surface and cls.fine_net(d) and not d.source.apart else "offset"
+        return "transport" if d.from_surface and cls.fine_net(d) and (d.source.by_lenslet or not d.source.apart) else "offset"
 
     @classmethod
     def refuse_settings(cls, d: Defaults) -> None:
@@ -256,7 +256,8 @@ class OneSurface(Problem):
 
         Diffraction and extended sources smooth creases more than a coarser net.
         """
-        creased = d.gaps >= GAPS and not (d.own_control or waves or d.shaped or cls.spread(d))
+        blurred = cls.spread(d) or (d.source.by_lenslet and max(d.source.extent) > 0)
+        creased = d.gaps >= GAPS and not (d.own_control or waves or d.shaped or blurred)
         if creased:
             plan = d.effort.creased if d.by_rows else d.effort.creased.coarser
             d.set_control([creased_control(max(d.resolution), p, plan) for p in d.lens.degree])

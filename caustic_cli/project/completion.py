@@ -85,7 +85,7 @@ def complete(
     s = s.changed(second=complete_second_size(s))
     s = s.changed(elements=complete_elements(s))
     build_screen(s.screen)
-    source = build_source(s.source)
+    source = build_source(s.source, lens=s.lens)
     s = s.changed(lens=complete_lens(s, source))
     return complete_design(Defaults(s, source, by.quality, by.rays, lit, gaps))
 
@@ -146,8 +146,9 @@ def complete_source(
         source = source.changed(also=[complete_source(table, lens, where="⟨source.also.type⟩") for table in source.also])
     types = [sources.type_of(source.type, where)]
     types += [sources.type_of(type, "⟨design.stages.source⟩") for type in stages if type]
+    width, height = (w / k for w, k in zip(lens.size, lens.array, strict=True)) if source.each else lens.size
     for type in types:
-        source = source.filled(**type.defaults(lens))
+        source = source.filled(**type.defaults(lens.changed(size=(width, height))))
     return source.without(*{*SourceSettings.of({})}.difference(sources.COMMON, *(type.keys for type in types)))
 
 
@@ -191,7 +192,7 @@ def complete_lens(s: Settings, source: Source) -> LensSettings:
         if s.screen.far:  # without deflection all light lands at its centre, not straight ahead
             across, along = across + 1.0, along + 1.0
         vergence = 0.0
-        if source.nearest < lens.z_in:  # vergence at the surface, 1/mm; 0 for a source at infinity
+        if source.nearest < lens.z_in and not source.by_lenslet:  # vergence at the surface, 1/mm; 0 for a source at infinity
             inside = interaction.interior(Interior(index)).index
             vergence = 1.0 / (lens.z_in - source.centre[2] + (lens.thickness - lens.z_in) / inside)
         radius = Offset.for_magnification((across, along), interaction.effective_index(index), z, lens.thickness, vergence).radius

@@ -175,7 +175,7 @@ class Project:
         s = self.settings
         other, room = _other_source(s.source, own.get("source", {})), self.room(given)
         if "room" in own:  # another light of the sun
-            stale = {"tilt", "angle", "also"} - own.get("source", {}).keys()
+            stale = {"tilt", "angle", "also", "each"} - own.get("source", {}).keys()
             other = {key: value for key, value in other.items() if key not in stale}
         if room is not None and ("room" in own or "tilt" not in own.get("source", {})):
             other = dict(complete_sunlight(SourceSettings(other), room, s.lens.array))
@@ -319,6 +319,7 @@ def _other_source(source: Mapping[str, Any], given: Mapping[str, Any]) -> dict[s
     gone = {"also"} if given.keys() - {"polarisation"} else set()
     type = given.get("type", source["type"])
     gone |= {"file"} if type != source["type"] else set()
+    gone |= set() if type in sources.used_by("each") and "angle" not in given else {"each"}
     gone |= {"weights"} if "wavelengths" in given else set()
     gone |= set() if type in sources.used_by("profile") else {"profile"}
     return {key: value for key, value in source.items() if key not in gone} | dict(given)

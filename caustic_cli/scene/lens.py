@@ -87,6 +87,12 @@ class Offset:
         return self.thickness + self.sag(x[:, None], y[None, :])
 
 
+def lenslet_centres(array: tuple[int, int], size: tuple[float, float]) -> list[tuple[float, float]]:
+    """Centres (x, y), mm, of the lenslets of an array of this size, j fastest."""
+    x, y = ([((k + 0.5) / n - 0.5) * w for k in range(n)] for n, w in zip(array, size, strict=True))
+    return [(a, b) for a in x for b in y]
+
+
 def array_control(n: int, degree: int, lenslets: int) -> int:
     """The least number of control points, at least n, for which all lenslets of a row have equally many knot spans; see
     `open_knots`."""

@@ -231,6 +231,9 @@ class SourceSettings(Section):
     position: Points | None = setting("point: one or several [x, y, z]; grid, disc: the centre; rays: the file's origin", "mm",
             *DISTANCE, derived="on the axis, five lens widths in front of the lens",
             option=Option("--source-position", "X,Y,Z", BOTH))
+    each: bool = setting("point, grid or disc: one such source behind every lenslet of an array, at this position from the"
+            " lenslet's centre and with this power; all shine at once, and each lenslet is designed for its own", default=False,
+            written=False, option=Option("--source-each", commands=BOTH))
     powers: Numbers | None = setting("point: relative power of each position", low=0.0, high=checks.POWER, derived="equal")
     size: Pair | None = setting("full width and height of a grid or disc", "mm", 0.0, 1e9, derived="a fifth of the lens",
             option=Option("--source-size", "W[xH]", BOTH))

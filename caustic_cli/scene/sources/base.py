@@ -138,6 +138,11 @@ class Source:
         return False
 
     @property
+    def by_lenslet(self) -> bool:
+        """Whether it is several sources, each for a lenslet of its own, in their order."""
+        return self.in_turn
+
+    @property
     def half_angle(self) -> float:
         """Largest angle of a distant source's rays to its axis."""
         return 0.0

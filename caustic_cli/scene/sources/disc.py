@@ -209,12 +209,9 @@ def _build(table: Table, _profile) -> Disc:
 def _idle(table: Table) -> dict[str, str]:
     why = "has no meaning for a disc at infinity, whose size is an angle (⟨source_angle⟩)"
     if "angle" in table:
-        return dict.fromkeys(("position", "size", "cone"), why)
+        return dict.fromkeys(("position", "each", "size", "cone"), why)
     return {"tilt": "is for light from infinity: a plane wave, or a disc with an angle (⟨source_angle⟩)"}
 
 
-TYPES = (
-    SourceType(
-        "disc", "disc", ("position", "size", "cone", "angle", "intensity", "aim", "file", "tilt"), _build, position_defaults, _idle
-    ),
-)
+KEYS = ("position", "each", "size", "cone", "angle", "intensity", "aim", "file", "tilt")
+TYPES = (SourceType("disc", "disc", KEYS, _build, position_defaults, _idle),)

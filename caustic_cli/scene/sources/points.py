@@ -149,6 +149,8 @@ def _grid(table: Table, _profile) -> Points:
 
 
 TYPES = (
-    SourceType("point", "point", ("position", "powers", "cone", "intensity", "aim"), _points, position_defaults),
-    SourceType("grid", "grid (of points)", ("position", "size", "grid", "cone", "intensity", "aim"), _grid, position_defaults),
+    SourceType("point", "point", ("position", "each", "powers", "cone", "intensity", "aim"), _points, position_defaults),
+    SourceType(
+        "grid", "grid (of points)", ("position", "each", "size", "grid", "cone", "intensity", "aim"), _grid, position_defaults
+    ),
 )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -41,6 +42,8 @@ class Several(Source):
     measures: tuple[Measure | None, ...] = ()
     #: Luminous efficacy of each, lm/W, where the eye sees them and their powers are in W; empty elsewhere.
     efficacies: tuple[float, ...] = ()
+    #: Whether each stands behind a lenslet of its own, in their order, and all shine at once.
+    behind: bool = False
 
     kind = "several"
 
@@ -95,6 +98,11 @@ class Several(Source):
     def in_turn(self) -> bool:
         """Whether they shine one after another, as the sun at several times: at infinity, not all in the direction of z."""
         return self.distant and self.oblique
+
+    @property
+    def by_lenslet(self) -> bool:
+        """Whether they shine in turn, or stand behind lenslets."""
+        return self.in_turn or self.behind
 
     @property
     def half_angle(self) -> float:
@@ -192,6 +200,33 @@ def together(members: Sequence[Source], lights: Sequence[Light]) -> Several:
     """Sources at once, each with its own light."""
     samples = tuple((light.wavelengths, light.weights) for light in lights)
     return Several(tuple(members), samples, tuple(light.measure for light in lights), efficacies(lights))
+
+
+def behind_lenslets(one: Source, light: Light, centres: Sequence[tuple[float, float]], pupil: Pupil) -> Source:
+    """One such source behind each lenslet of an array, displaced to its centre, (x, y) mm.
+
+    Their cone is that which is given, or the narrowest that covers the pupil of the array from all of them, so that equal powers
+    are equal intensities.
+
+    Raises:
+        InputError: the source is not a single one nearby, or there are too many lenslets.
+    """
+    if one.distant or one.rays is not None or one.apart:
+        where = ", which is at infinity" if one.distant else ""
+        raise InputError(f"⟨source.each⟩ is for one point, grid or disc nearby, got {one.label}{where}")
+    if len(centres) > MOST:
+        raise InputError(f"⟨source.each⟩ is for arrays of up to {MOST} lenslets, got {len(centres)}")
+    if len(centres) == 1:
+        return one
+    placed = [one.displaced(partial(_moved, by), 1.0) for by in centres]
+    cone = math.degrees(max(source.cone_over(pupil) for source in placed))
+    members = [replace(cast(Any, source), cone=cone) for source in placed]
+    return replace(together(members, [light] * len(members)), behind=True)
+
+
+def _moved(by: tuple[float, float], at: Sequence[float]) -> tuple[float, float, float]:
+    """A position, mm, moved along x and y."""
+    return at[0] + by[0], at[1] + by[1], at[2]
 
 
 def efficacies(lights: Sequence[Light]) -> tuple[float, ...]:

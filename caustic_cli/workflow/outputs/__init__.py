@@ -19,6 +19,7 @@ from caustic_cli.workflow.outputs.rays_plot import RaysPlot
 from caustic_cli.workflow.outputs.report import ManufacturingReport
 from caustic_cli.workflow.outputs.second_target import SecondPicture
 from caustic_cli.workflow.outputs.shop import ShopPage
+from caustic_cli.workflow.outputs.stray import Stray
 from caustic_cli.workflow.outputs.test_card import TestCard
 from caustic_cli.workflow.outputs.tolerances import ToleranceAnalysis
 from caustic_cli.workflow.outputs.values import PixelValues
@@ -29,6 +30,7 @@ OUTPUTS: tuple[type[Output], ...] = (
     RayPicture,
     SecondPicture,
     Hours,
+    Stray,
     WavePicture,
     PixelValues,
     MachinedSurface,

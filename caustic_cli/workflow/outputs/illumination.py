@@ -1,4 +1,4 @@
-"""Target illumination by a lenslet array: image of each lenslet, and brightness of its source by non-negative least squares."""
+"""Target illumination by a lenslet array: image of each lenslet's source, and its brightness by non-negative least squares."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ import numpy as np
 from caustic_cli.inverse.lenslets import lenslets
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.picture import read_picture, write_image
-from caustic_cli.optics.plan import compile_plan
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.brightness import brightness
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.studies.retrace import retrace, white_level
+from caustic_cli.studies.retrace import white_level
 from caustic_cli.workflow.lens import Lens
-from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
+from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint, image_alone
 
 
 @dataclass(eq=False)
@@ -91,23 +90,16 @@ class Illumination(Output):
 
 
 def _images(rendering: Rendering) -> Iterator[tuple[float, np.ndarray]]:
-    """Of each lenslet, its share of the light and the image of this light (n_x, n_y)."""
-    lens, device = rendering.lens, rendering.device
-    parts = lenslets(rendering.plan.scene, lens.field.shape)
+    """Of each lenslet's source, its share of the light and the image of this light (n_x, n_y): of a beam through the lenslet alone,
+    of a source behind it through the whole array."""
+    lens, scene = rendering.lens, rendering.plan.scene
+    if scene.source.by_lenslet and not scene.source.in_turn:
+        whole = zip(scene.by_source, scene.source.fractions, strict=True)
+        parts = [(one, lens.field, lens.heights, share) for one, share in whole]
+    else:
+        own = lenslets(scene, lens.field.shape)
+        parts = [(one.scene, one.field, one.of(lens.heights), one.share) for one in own]
     with rendering.say.progress(len(parts)) as show:
-        for k, one in enumerate(parts):
+        for k, (*one, share) in enumerate(parts):
             show("lenslets", f"{k + 1} of {len(parts)}", k, len(parts))
-            heights = one.of(lens.heights)
-            alone = compile_plan(one.scene, one.field, heights)
-            found, _ = retrace(
-                alone.scene,
-                one.field,
-                heights.to(device),
-                None,
-                rays=max(1, rendering.count // len(parts)),
-                seed=rendering.seed,
-                device=device,
-                requests=alone.requests,
-                noise=False,
-            )
-            yield one.share, one.share * found.image.cpu().numpy()
+            yield share, share * image_alone(rendering, *one, len(parts))
