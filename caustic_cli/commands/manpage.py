@@ -178,8 +178,8 @@ For a sundial: relative_rms of all light on the screen at the time of each lensl
 light to that of the others on the bright part of the picture; in the order of the lenslets. hours_image: all images as a sheet.
 .TP
 .B stray
-For an array with a source behind every lenslet: the fraction of the light on the screen that has not passed the lenslet of its own
-source.
+For an array with a source behind every lenslet: on_lens and on_screen, the fractions of the light on the lens and on the screen
+that entered another lenslet than that of its source.
 .TP
 .B want
 For an array with a prescribed illumination: brightness of each lenslet's source relative to the largest, N lists of M; error, the

@@ -81,9 +81,19 @@ class LensletArray(OneSurface):
         return creased
 
     @classmethod
+    def by_lenslets(cls, d: Defaults) -> bool:
+        """Whether stages compare every lenslet with its own picture, or in the light of its own source: few of that source's rays
+        over the whole array would meet it."""
+        return d.s.target.sheet or d.s.source.each
+
+    @classmethod
+    def spread(cls, d: Defaults) -> bool:
+        return super().spread(d) and not cls.by_lenslets(d)
+
+    @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
         stages = cls.refinement(d, cls.creased(d, waves))
-        if d.s.target.sheet or d.s.source.each:  # of rays over the whole array few would meet the lenslet of their source
+        if cls.by_lenslets(d):
             stages = each_lenslet(stages, math.prod(d.lens.array), d.resolution)
         return stages
 

@@ -10,20 +10,17 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from caustic_cli.config.design import filter_from
 from caustic_cli.io.files import sha256_of
 from caustic_cli.io.picture import WIDE
 from caustic_cli.optics.emission.measured import coarse_words
-from caustic_cli.optics.plan import Plan, compile_plan
+from caustic_cli.optics.plan import Plan
 from caustic_cli.optics.surfaces.cut import CutSurface
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import RENDER, Project
 from caustic_cli.project.uptodate import FILES
 from caustic_cli.scene import Scene
 from caustic_cli.scene.traits import Capability
-from caustic_cli.studies.retrace import retrace
 from caustic_cli.workflow.lens import Lens, Render
 from caustic_cli.workflow.reporter import Reporter
 
@@ -251,26 +248,6 @@ class Output:
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
         """Print its figures, from those of the render; say: with `table` and `result`, as of the command line."""
-
-
-def image_alone(rendering: Rendering, scene: Scene, field: HeightField, heights: Tensor, of: int) -> np.ndarray:
-    """The image (n_x, n_y) of one of `of` parts of the light of a render, in parts of the power of its own source.
-
-    field, heights: spline spaces and control heights, mm, of what this part passes.
-    """
-    alone = compile_plan(scene, field, heights)
-    found, _ = retrace(
-        alone.scene,
-        field,
-        heights.to(rendering.device),
-        None,
-        rays=max(1, rendering.count // of),
-        seed=rendering.seed,
-        device=rendering.device,
-        requests=alone.requests,
-        noise=False,
-    )
-    return found.image.cpu().numpy()
 
 
 def single(name: str, option: str) -> Capability:

@@ -8,16 +8,20 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from torch import Tensor
 
 from caustic_cli.inverse.lenslets import lenslets
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.picture import read_picture, write_image
+from caustic_cli.optics.plan import compile_plan
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Scene
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.brightness import brightness
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.studies.retrace import white_level
+from caustic_cli.studies.retrace import retrace, white_level
 from caustic_cli.workflow.lens import Lens
-from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint, image_alone
+from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
 
 
 @dataclass(eq=False)
@@ -102,4 +106,21 @@ def _images(rendering: Rendering) -> Iterator[tuple[float, np.ndarray]]:
     with rendering.say.progress(len(parts)) as show:
         for k, (*one, share) in enumerate(parts):
             show("lenslets", f"{k + 1} of {len(parts)}", k, len(parts))
-            yield share, share * image_alone(rendering, *one, len(parts))
+            yield share, share * _image(rendering, *one, rendering.count // len(parts))
+
+
+def _image(rendering: Rendering, scene: Scene, field: HeightField, heights: Tensor, rays: int) -> np.ndarray:
+    """The image (n_x, n_y) of the light of a scene through a surface: spline spaces and control heights, mm."""
+    alone, device = compile_plan(scene, field, heights), rendering.device
+    found, _ = retrace(
+        alone.scene,
+        field,
+        heights.to(device),
+        None,
+        rays=max(1, rays),
+        seed=rendering.seed,
+        device=device,
+        requests=alone.requests,
+        noise=False,
+    )
+    return found.image.cpu().numpy()

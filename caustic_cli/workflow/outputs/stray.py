@@ -1,27 +1,31 @@
-"""Stray light of an array with a source behind every lenslet: what does not reach the screen through the source's own lenslet."""
+"""Stray light of an array with a source behind every lenslet."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
-from caustic_cli.inverse.lenslets import lenslets
-from caustic_cli.workflow.outputs.base import Output, Rendering, image_alone
+from caustic_cli.loading import OnDemand
+from caustic_cli.workflow.outputs.base import Output, Rendering
+
+study = OnDemand("caustic_cli.studies.stray")
 
 
 class Stray(Output):
-    """The fraction of the light on the screen that is stray, as of every render of such an array."""
+    """Its fractions of the light on the lens and of that on the screen, as of every render of such an array."""
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
-        """stray: the fraction; none if no light is on the screen."""
-        source, total = rendering.plan.scene.source, float(rendering.image.sum())
-        if not source.by_lenslet or source.in_turn or not total > 0:
+        """stray: on_lens and on_screen, of the light there; none if no light is on the screen."""
+        lens, plan, total = rendering.lens, rendering.plan, float(rendering.image.sum())
+        if not plan.scene.source.by_lenslet or plan.scene.source.in_turn or not total > 0:
             return {}
-        parts = lenslets(rendering.plan.scene, rendering.lens.field.shape)
-        own = [image_alone(rendering, one.scene, one.field, one.of(rendering.lens.heights), len(parts)).sum() for one in parts]
-        return {"stray": 1.0 - math.fsum(part * light for part, light in zip(source.fractions, own, strict=True)) / total}
+        with rendering.say.notify_if_slow("tracing the light of every source through the lenslets of others"):
+            fallen, seen = study.stray_light(
+                plan.scene, lens.field, lens.heights, rendering.count, rendering.seed, rendering.device, plan.requests
+            )
+        return {"stray": {"on_lens": fallen / (1.0 - rendering.figures["lost"]["missed_lens"]), "on_screen": seen / total}}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
         if "stray" in figures:
-            words = "of the light on the screen is that of sources behind other lenslets"
-            say.table("the sources of the lenslets", [("stray light", f"{figures['stray']:.1%} {words}")])
+            parts = figures["stray"]
+            words = f"{parts['on_lens']:.2%} of that on the lens, {parts['on_screen']:.2%} of that on the screen"
+            say.table("light of sources through other lenslets than their own", [("stray light", words)])

@@ -1,0 +1,73 @@
+"""Stray light of an array with a source behind every lenslet: light of a source that enters another lenslet than its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.effects import NO_REQUESTS, Requests
+from caustic_cli.optics.emission import Rays
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
+from caustic_cli.scene import Scene
+from caustic_cli.scene.lens import lenslet_centres
+from caustic_cli.studies.retrace import sampler_for
+
+
+@dataclass(frozen=True, eq=False)
+class _Beside:
+    """The rays of a near source beside a rectangle of the pupil, given by its middle and half widths, mm; those through it count as
+    missing the lens."""
+
+    rays: Rays
+    middle: tuple[float, float]
+    half: tuple[float, float]
+    device: str | torch.device = "cpu"
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        return self.rays.count
+
+    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
+        """As of an `Emission`."""
+        for rays in self.rays.chunks(size, first, step):
+            assert isinstance(rays, RayState)  # of all near sources
+            x, y = (torch.as_tensor(c) - m for c, m in zip(rays.origin[:2], self.middle, strict=True))
+            own = (x.abs() <= self.half[0]) & (y.abs() <= self.half[1])
+            power = torch.where(own, torch.zeros_like(rays.power), rays.power)
+            missed = rays.lost["missed_lens"] + float((rays.power - power).sum())
+            yield replace(rays, power=power, lost={**rays.lost, "missed_lens": missed})
+
+
+@torch.no_grad()
+def stray_light(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    rays: int,
+    seed: int = 0,
+    device: str = "cpu",
+    requests: Requests = NO_REQUESTS,
+) -> tuple[float, float]:
+    """Stray light on the array and on the screen, as fractions of the power of all sources.
+
+    Args:
+        scene: with a source behind every lenslet; heights: control net (n, m) of the array, mm.
+        rays: of all sources; requests: of a plan.
+    """
+    lens, fallen, seen = scene.lens, [], []
+    half = tuple(r / k for r, k in zip(lens.half_size, lens.array, strict=True))
+    each = zip(scene.by_source, scene.source.fractions, lenslet_centres(lens.array, lens.size), strict=True)
+    for k, (one, part, middle) in enumerate(each):
+        whole = sampler_for(one, max(1, rays // math.prod(lens.array)), seed + k, device)
+        light = _Beside(whole, middle, (half[0], half[1]), device)
+        image = expose(one, field, heights.to(device), light, None, torch.float64, requests=requests)
+        fallen.append(part * (1.0 - image.lost["missed_lens"]))
+        seen.append(part * float(image.image.sum()))
+    return math.fsum(fallen), math.fsum(seen)
