@@ -167,6 +167,15 @@ def test_a_design_with_a_source_each(leds, monkeypatch):
     assert float(mirrored.abs().max()) < 0.05 * float(lens.heights.max() - lens.heights.min())
 
 
+def test_a_sheet_in_the_light_of_one_disc(leds, monkeypatch):
+    """Stages that compare lenslets, without the blur as a convolution."""
+    monkeypatch.chdir(leds)
+    line = f"design sheet.npy --sheet {ARRAY} --source disc --source-position 0,0,-40 --control 23 {SMALL} -o one.caustic"
+    assert cli.run(shlex.split(line)) == 0
+    project = Project.open("one.caustic")
+    assert all(stage.lenslets and not stage.spread for stage in project.settings.design.stages)
+
+
 def test_brightness_and_stray_light(leds, monkeypatch, capfd):
     monkeypatch.chdir(leds)
     code, out, err = run("render p.caustic --want goal.npy --rays 2e5 --json --force --quiet", capfd)

@@ -75,7 +75,8 @@ class LensletArray(OneSurface):
 
     @classmethod
     def creased(cls, d: Defaults, waves: list[Table]) -> bool:
-        creased = super().creased(d, waves)
+        blurred = d.source.by_lenslet and max(d.source.extent) > 0  # so near that creases are smooth whatever the net
+        creased = not blurred and super().creased(d, waves)
         if creased:
             d.set_control(cls.fitting(d))
         return creased

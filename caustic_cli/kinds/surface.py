@@ -256,8 +256,7 @@ class OneSurface(Problem):
 
         Diffraction and extended sources smooth creases more than a coarser net.
         """
-        blurred = cls.spread(d) or (d.source.by_lenslet and max(d.source.extent) > 0)
-        creased = d.gaps >= GAPS and not (d.own_control or waves or d.shaped or blurred)
+        creased = d.gaps >= GAPS and not (d.own_control or waves or d.shaped or cls.spread(d))
         if creased:
             plan = d.effort.creased if d.by_rows else d.effort.creased.coarser
             d.set_control([creased_control(max(d.resolution), p, plan) for p in d.lens.degree])
