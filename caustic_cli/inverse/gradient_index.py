@@ -26,6 +26,7 @@ from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.inverse.losses import NoLight
@@ -77,15 +78,17 @@ class GradientIndexDesign:
     history: tuple[tuple[float, float], ...]
 
 
-def plate_system(scene: Scene, index: SplineIndex) -> System:
-    """System of a flat entrance, a flat exit at the thickness of the lens, and the index field between them."""
+def plate_system(scene: Scene, index: SplineIndex, exit: HeightField | None = None) -> System:
+    """System of a flat entrance, an exit, and the index field between them; exit: its spline spaces, None for a flat one at the
+    thickness of the lens."""
     lens, aperture = scene.lens, scene.lens.opening
     inside = GradientMedium(lens.index, lens.absorption, lens.glass, gradient=index)
+    behind = Pose((0.0, 0.0, lens.offset.thickness)) if exit is None else Pose()
     return System(
         (scene.source,),
         (
             Element(ENTRANCE, Plane(), aperture, behind=inside, pose=Pose((0.0, 0.0, lens.z_in)), fresnel=lens.fresnel),
-            Element(EXIT, Plane(), aperture, pose=Pose((0.0, 0.0, lens.offset.thickness)), fresnel=lens.fresnel),
+            Element(EXIT, exit or Plane(), aperture, pose=behind, fresnel=lens.fresnel),
         ),
         (scene.screen,),
         scene.light,
@@ -126,14 +129,11 @@ def design_gradient_index(
     """
     lens = scene.lens
     low, high = limits or (lens.index - 0.05, lens.index + 0.05)
-    _refuse(scene, (low, high))
+    refuse_index_design(scene, (low, high))
     values = torch.from_numpy(begin) if begin is not None else _first_layer(scene, target, control, (low, high), cells)
 
-    def volume(values: Tensor) -> SplineIndex:
-        return SplineIndex(values, lens.half_size, lens.offset.thickness - lens.z_in)
-
-    initial = volume(values.reshape(*control, -1).expand(-1, -1, layers).contiguous())
-    objective = _IndexObjective(scene, target, initial, rays or RAYS_A_PIXEL * math.prod(scene.screen.resolution), seed)
+    initial = volume(scene, values.reshape(*control, -1).expand(-1, -1, layers).contiguous())
+    objective = IndexObjective(scene, target, initial, rays or RAYS_A_PIXEL * math.prod(scene.screen.resolution), seed)
     loss = _LossOfLayers(objective, initial.coefficients, (low, high))
     search = LBFGS(loss, torch.zeros(layers * math.prod(control), dtype=torch.float64))
     history: list[tuple[float, float]] = []
@@ -146,13 +146,13 @@ def design_gradient_index(
         history.append((search.f, result.on_screen))
         on_iteration(k + 1, search.f, result.on_screen, result.image)
     with torch.no_grad():
-        return GradientIndexDesign(volume(loss.values(search.x)), initial, tuple(history))
+        return GradientIndexDesign(volume(scene, loss.values(search.x)), initial, tuple(history))
 
 
 class _LossOfLayers:
     """The loss as a function of unknowns x (layers n m,), which are 0 for the initial control values (n, m, layers)."""
 
-    def __init__(self, objective: _IndexObjective, initial: Tensor, limits: tuple[float, float]):
+    def __init__(self, objective: IndexObjective, initial: Tensor, limits: tuple[float, float]):
         layers = [layer.contiguous() for layer in initial.double().unbind(-1)]
         low, high = (torch.full_like(layers[0], limit) for limit in limits)
         self.objective, self.nets = objective, [FreeHeights(low, high, layer, laplacian=True) for layer in layers]
@@ -179,7 +179,12 @@ class _LossOfLayers:
         return result.loss, torch.stack(by).reshape(-1)
 
 
-def _refuse(scene: Scene, limits: tuple[float, float]) -> None:
+def volume(scene: Scene, values: Tensor) -> SplineIndex:
+    """The field of control values (n, m, layers) over the aperture and the thickness of a lens."""
+    return SplineIndex(values, scene.lens.half_size, scene.lens.offset.thickness - scene.lens.z_in)
+
+
+def refuse_index_design(scene: Scene, limits: tuple[float, float]) -> None:
     """Refuse what has no such design; errors as of `design_gradient_index`."""
     lens, (low, high) = scene.lens, limits
     INDEX_DESIGN.refuse(scene)
@@ -192,9 +197,7 @@ def _refuse(scene: Scene, limits: tuple[float, float]) -> None:
 def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], limits: tuple[float, float], cells: int) -> Tensor:
     """Control values (n, m) of the initial index within its limits, independent of z; errors as of `design_gradient_index`."""
     lens, (low, high) = scene.lens, limits
-    net = HeightField.of(replace(lens, control=control, degree=(3, 3), knots=None, gradient=None))
-    layer = _start(scene, target, net, cells)
-    layer = layer - 0.5 * float(layer.min() + layer.max()) + 0.5 * (low + high)
+    layer = transport_index(scene, target, control, cells) + 0.5 * (low + high)
     spread, room = float(layer.max() - layer.min()), high - low
     if spread > (1.0 - 2.0 * INSIDE) * room:
         raise InputError(
@@ -204,22 +207,33 @@ def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], lim
     return layer
 
 
-class _IndexObjective(Objective):
-    """The loss as a function of the control values of the index, {name: (n, m, k)}."""
+class IndexObjective(Objective):
+    """The loss as a function of the control values of the index, {name: (n, m, k)}; and of the heights of the exit, {EXIT: (n, m)}
+    mm, where its spline spaces are given, within `limits`."""
 
-    def __init__(self, scene: Scene, target: np.ndarray, index: SplineIndex, rays: int, seed: int):
-        self.system = plate_system(scene, index)
+    def __init__(
+        self,
+        scene: Scene,
+        target: np.ndarray,
+        index: SplineIndex,
+        rays: int,
+        seed: int,
+        exit: HeightField | None = None,
+        limits: Limits | None = None,
+    ):
+        self.system = plate_system(scene, index, exit)
         self.name = index_name(self.system.elements[0])
         flat = HeightField.of(replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None))
         apron = math.ceil(APRON * max(scene.screen.resolution))
         sampler = rays_of(scene, "grid", rays, stream(seed, "gradient blank"))
         super().__init__(
             scene,
-            flat,
+            exit or flat,
             sampler,
             torch.from_numpy(np.ascontiguousarray(target, dtype=np.float64)),
             "rms-light",
             LossImage(apron=apron, oversample=OVERSAMPLE),
+            limits,
             dtype=torch.float64,
         )
 
@@ -231,9 +245,11 @@ class _IndexObjective(Objective):
             yield 0, traced
 
 
-def _start(scene: Scene, target: np.ndarray, net: HeightField, cells: int) -> Tensor:
-    """Control values (n, m) of the initial index, to first order in the thickness and up to a constant."""
+def transport_index(scene: Scene, target: np.ndarray, control: tuple[int, int], cells: int) -> Tensor:
+    """Control values (n, m) of an index that throws the picture, to first order in the thickness, less the middle of their range;
+    cells: source cells of the transport along the longer side."""
     lens, screen = scene.lens, scene.screen
+    net = HeightField.of(replace(lens, control=control, degree=(3, 3), knots=None, gradient=None))
     (a, b), t = lens.half_size, lens.offset.thickness - lens.z_in
     n, m = (max(4, round(cells * r / max(a, b))) for r in (a, b))
     x, y = corners(n, a), corners(m, b)
@@ -251,4 +267,5 @@ def _start(scene: Scene, target: np.ndarray, net: HeightField, cells: int) -> Te
     step = float(x[1] - x[0]), float(y[1] - y[0])
     values = integrate(sines[0] / t, sines[1] / t, step)
     spline = RectBivariateSpline(x, y, values)
-    return net.interpolated(torch.from_numpy(spline(*(c.numpy() for c in net.control_xy()))))
+    found = net.interpolated(torch.from_numpy(spline(*(c.numpy() for c in net.control_xy()))))
+    return found - 0.5 * float(found.min() + found.max())

@@ -16,6 +16,7 @@ from caustic_cli.kinds.surface import Described, OneSurface
 #: All kinds beside a single surface, each with the setting or section without which it does not apply and is not loaded; a design
 #: is of the first that applies.
 KINDS = (
+    ("lens.with_surface", "gradient_index.GradedLens"),
     ("lens.gradient", "gradient_index.IndexPlate"),
     ("design.robust", "robust.RobustTwoSides"),
     ("second", "two_sided.TwoSides"),

@@ -1,6 +1,6 @@
-"""A flat plate whose refractive index is designed, evaluated like any lens.
+"""Lenses whose refractive index is designed, evaluated like any lens: a flat plate, and a lens whose exit is designed with it.
 
-The control values of the index are a file of the project, which [lens] index_file names; the checkpoint holds the flat exit.
+The control values of the index are a file of the project, which [lens] index_file names; the checkpoint holds the exit.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,12 +19,22 @@ from torch import Tensor
 from caustic_cli.config.default_stages import refinement, transport_cells
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.designer import State
+from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.graded_lens import Start, design_graded_lens, initial_index
 from caustic_cli.inverse.gradient_index import design_gradient_index
+from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.kinds.defaults import Defaults
-from caustic_cli.kinds.surface import OneSurface
+from caustic_cli.kinds.surface import Described, OneSurface
+from caustic_cli.loading import OnDemand
+from caustic_cli.optics.system import trace_arguments
+from caustic_cli.scene import Scene
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.schema.table import LensSettings, ScreenSettings, check, check_all
 
+manufacture = OnDemand("caustic_cli.studies.manufacture")
+
+#: Called with the iteration, the loss, the fraction of the light on the screen and the image there.
+OnIteration = Callable[[int, float, float, Tensor | None], None]
 #: Half range about the index; degree of its splines, knot spans per pixel and their largest number.
 HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS = 0.05, 3, 2, 768
 RAYS_BENT, ITERATIONS = 16, 24  # largest number of rays per pixel, since they cost more; and iterations
@@ -32,6 +44,8 @@ class IndexPlate(OneSurface):
     """A plate with a designed index; its surface is flat."""
 
     in_stages = False
+    #: What a user may call the start.
+    starts: tuple[str, ...] = ("offset", "transport")
 
     @classmethod
     def applies(cls, s: Settings) -> bool:
@@ -39,12 +53,8 @@ class IndexPlate(OneSurface):
 
     @classmethod
     def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
-        """A plane-parallel blank; its sides have the smallest control net."""
-        lens = lens.filled(radius=(math.inf, math.inf))
-        if any(map(math.isfinite, lens.radius)):
-            raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {list(lens.radius)}")
-        lens = lens.filled(
-            control=[p + 1 for p in check("lens.degree", lens.degree)],
+        """The lens with the range and the control values of its index."""
+        lens = cls.sides(lens).filled(
             index_range=(max(1.0, index - HALF_RANGE), index + HALF_RANGE),
             index_control=[min(MOST_SPANS, INDEX_SPANS * n) + INDEX_DEGREE for n in screen.resolution],
         )
@@ -54,20 +64,33 @@ class IndexPlate(OneSurface):
         return super().blank(lens, screen, index)
 
     @classmethod
+    def sides(cls, lens: LensSettings) -> LensSettings:
+        """The lens with what both sides are: flat, on the smallest control net."""
+        lens = lens.filled(radius=(math.inf, math.inf))
+        if any(map(math.isfinite, lens.radius)):
+            raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {list(lens.radius)}")
+        return lens.filled(control=[p + 1 for p in check("lens.degree", lens.degree)])
+
+    @classmethod
     def complete(cls, d: Defaults) -> None:
         """L-BFGS from optimal transport, on rays."""
-        s, lens, design = d.s, d.lens, d.design
+        s, design = d.s, d.design
         if not d.source.collimated:
             raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s.source.type}")
         check("design.waves", design.waves)
-        if design.get("start", "offset") not in ("offset", "transport"):
+        if design.get("start", "transport") not in cls.starts:
             raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design.start}")
-        d.set_design(start="offset")  # of the surface, which is flat; the index starts from optimal transport
-        d.fill_design(preconditioner="laplacian")
+        cls.complete_surface(d)
         if "stages" not in design:
-            last = refinement(lens.control, d.rays, d.resolution, d.effort.refinement)[-1]
+            last = refinement(d.lens.control, d.rays, d.resolution, d.effort.refinement)[-1]
             rays = d.rays or min(last["rays"], RAYS_BENT * math.prod(d.resolution))
             d.set_stages([last | {"rays": rays, "oversample": min(4, last["oversample"]), "iterations": ITERATIONS}])
+
+    @classmethod
+    def complete_surface(cls, d: Defaults) -> None:
+        """Complete how the exit is designed: it is flat, and the index starts from optimal transport."""
+        d.set_design(start="offset")
+        d.fill_design(preconditioner="laplacian")
 
     def iterate(
         self,
@@ -91,10 +114,9 @@ class IndexPlate(OneSurface):
         Raises:
             InputError: as of `design_gradient_index`.
         """
-        stage, target = self.stages[-1], self.target.numpy()
         limit = time_limit if math.isinf(time_limit) else 2.0 * time_limit / 3.0
-        flat = torch.full(lens.control, float(self.scene.lens.offset.thickness), dtype=torch.float64)
-        before, now = state.seconds, State(flat, total=state.total, iteration=state.total, history=list(state.history))
+        before, now = state.seconds, State(self.first_exit(state), total=state.total, iteration=state.total)
+        now.history = list(state.history)
 
         def late() -> bool:
             return time.monotonic() - began > limit
@@ -105,29 +127,54 @@ class IndexPlate(OneSurface):
             now.history.append((now.total, 0, loss, on_screen, now.seconds))
             on_iteration(now)
 
-        designed = self.scene.lens.gradient if state.total else None
-        blank = replace(self.scene, lens=replace(self.scene.lens, gradient=None))
-        design = design_gradient_index(
-            blank,
-            target,
-            lens.index_control,
-            lens.index_layers,
-            lens.index_range,
-            cells=transport_cells(stage.rays, False, least=self.effort.source_cells),
-            iterations=max(0, total - state.total),
-            rays=stage.rays,
-            seed=self.options.seed,
-            begin=None if designed is None else designed.volume,
-            on_iteration=done,
-            stop=lambda: stop() or late(),
-        )
+        values = self.search(lens, state, now, max(0, total - state.total), done, lambda: stop() or late())
         if stop():
             now.reason = "interrupted"
         elif now.total >= total:
             now.reason = "iterations"
         else:
             now.reason = "time limit" if late() else "no progress"
-        return design.index.coefficients.numpy(), now
+        return values, now
+
+    def first_exit(self, state: State) -> Tensor:
+        """Heights (n, m) mm of the exit before the first iteration: flat."""
+        return torch.full_like(state.heights, float(self.scene.lens.offset.thickness))
+
+    @property
+    def _blank(self) -> Scene:
+        """The scene with a lens of one index."""
+        return replace(self.scene, lens=replace(self.scene.lens, gradient=None))
+
+    @property
+    def _designed(self) -> np.ndarray | None:
+        """Control values (n, m, layers) of the index that a design has found so far, None before it."""
+        gradient = self.scene.lens.gradient
+        return None if gradient is None else gradient.volume
+
+    @property
+    def _cells(self) -> int:
+        """Source cells of the transport for the initial index."""
+        return transport_cells(self.stages[-1].rays, False, least=self.effort.source_cells)
+
+    def search(
+        self, lens: LensSettings, state: State, now: State, iterations: int, done: OnIteration, stop: Callable[[], bool]
+    ) -> np.ndarray:
+        """Iterate from the index and the exit of `state`; the control values (n, m, layers) found, and the exit in `now`."""
+        design = design_gradient_index(
+            self._blank,
+            self.target.numpy(),
+            lens.index_control,
+            lens.index_layers,
+            lens.index_range,
+            cells=self._cells,
+            iterations=iterations,
+            rays=self.stages[-1].rays,
+            seed=self.options.seed,
+            begin=self._designed if state.total else None,
+            on_iteration=done,
+            stop=stop,
+        )
+        return design.index.coefficients.numpy()
 
     def words(self, lens: LensSettings) -> str:
         """What is designed, before it is."""
@@ -135,3 +182,78 @@ class IndexPlate(OneSurface):
             f"index: {lens.index_control[0]} x {lens.index_control[1]} x {lens.index_layers} control values"
             f" of {lens.index_range[0]:.4g} to {lens.index_range[1]:.4g}, {self.stages[-1].rays:,} rays"
         )
+
+
+class GradedLens(IndexPlate):
+    """A lens whose index and exit are designed together.
+
+    Args:
+        index: control values along x and y, and range, of the index.
+    """
+
+    starts = ("transport",)
+
+    def __init__(self, *args: Any, index: tuple[tuple[int, int], tuple[float, float]], **more: Any):
+        self.index_control, self.index_range = index
+        super().__init__(*args, **more)
+
+    @classmethod
+    def applies(cls, s: Settings) -> bool:
+        return super().applies(s) and s.lens.with_surface
+
+    @classmethod
+    def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
+        lens = described.settings.lens
+        return {"index": (lens.index_control, lens.index_range)} | super().further(described, scene)
+
+    @classmethod
+    def sides(cls, lens: LensSettings) -> LensSettings:
+        return lens
+
+    @classmethod
+    def complete_surface(cls, d: Defaults) -> None:
+        """It starts from optimal transport of the light that the initial index bends."""
+        d.set_design(start="transport")
+        cls.complete_control(d)
+        cls.creased(d, [])
+        d.fill_design(preconditioner="none")
+
+    @cached_property
+    def initial_index(self) -> Tensor:
+        """Control values (n, m) of the initial index."""
+        return initial_index(self._blank, self.target.numpy(), self.index_control, self.index_range, self._cells)
+
+    def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
+        gradient = Gradient("volume", volume=self.initial_index.numpy())
+        return super().solved(replace(scene, lens=replace(scene.lens, gradient=gradient)), goal, cells, fixed, seconds)
+
+    def first_exit(self, state: State) -> Tensor:
+        return state.heights
+
+    def search(
+        self, lens: LensSettings, state: State, now: State, iterations: int, done: OnIteration, stop: Callable[[], bool]
+    ) -> np.ndarray:
+        begun = self._designed if state.total else None
+        first = self.initial_index[:, :, None].expand(-1, -1, lens.index_layers) if begun is None else torch.from_numpy(begun)
+        found = design_graded_lens(
+            self._blank,
+            self.field(0),
+            self.target.numpy(),
+            Start(state.heights, first.contiguous(), self.bounds(0), lens.index_range),
+            rays=self.stages[-1].rays,
+            iterations=iterations,
+            seed=self.options.seed,
+            limits=self.options.limits,
+            known=state.optimizer,
+            on_iteration=done,
+            stop=stop,
+        )
+        now.heights, now.optimizer = self.feasible(0, found.heights), found.state
+        return found.index.coefficients.numpy()
+
+    def further_figures(self, designer: Designer, state: State) -> dict[str, Any]:
+        return manufacture.wall_and_stock(*trace_arguments(self.scene, designer.field(state.stage), state.heights))
+
+    def words(self, lens: LensSettings) -> str:
+        control = self.stages[-1].control
+        return f"{super().words(lens)}; exit: {control[0]} x {control[1]} control points"

@@ -66,7 +66,7 @@ def new_project(
     if full.lamp is not None:
         full = attachments.named_in_project(_with_picture(full, picture))
         return Project(out, full, picture, uptodate.digest(full, picture)), said
-    for key in ("index_range", "index_control", "index_layers"):
+    for key in ("index_range", "index_control", "index_layers", "with_surface"):
         if f"lens.{key}" in given and full.lens.gradient != "free":
             raise InputError(f"⟨lens.{key}⟩ belongs to ⟨+lens.gradient⟩ free")
     if full.lens.mirror and "shift" not in full.screen and any(shift := _beside_the_light(full)):

@@ -380,7 +380,8 @@ class LensSettings(Section):
     array: Wholes = setting("lenslets along x and y, each of which projects the whole picture, or lamps on a board", low=1,
             high=100, default=[1, 1], written=False, option=Option("--array", "N[xM]"))
     gradient: str | None = setting("gradient index of the lens: selfoc, radial or axial, with gradient_terms; volume, with an"
-            " index_file; free, designed instead of the surface, between flat sides",
+            " index_file; free, designed instead of the surface, between flat sides, or"
+            " together with it (with_surface)",
             choices=("selfoc", "radial", "axial", "volume", "free"), derived="homogeneous",
             option=Option("--gradient", "selfoc|radial|axial|volume|free"))
     gradient_terms: Numbers | None = setting("selfoc: g of n^2 = index^2 (1 - (g r)^2), 1/mm; radial: a, b, ... of index + a r^2 +"
@@ -396,6 +397,9 @@ class LensSettings(Section):
             derived="two knot spans per pixel", why="as for a surface", option=Option("--index-control", "N[xM]"))
     index_layers: int = setting("control values of a free gradient along z", low=1, high=64, default=1, written=False,
             why="in a thin blank only the integral of the index along a ray matters")
+    with_surface: bool = setting("the exit of a lens with a free gradient is designed together with its index, instead of two flat"
+            " sides; the index begins with half of the deflection, or as much as its range allows", default=False, written=False,
+            option=Option("--with-surface"))
     control: Wholes = setting("control points of the finished lens", low=2, high=4096, derived="by picture and quality: two knot"
             " spans per pixel", why="finer than the picture, so that it is no limit", option=Option("--control", "N[xM]"))
     degree: Wholes = setting("spline degrees, 1 to 15", low=1, high=15, default=[3, 3], why="the least with continuous curvature",

@@ -281,7 +281,7 @@ def _run(
 def _run_index(
     project: Project, problem: OneSurface, state: State, say: Reporter, began: Start, time_limit: float | None, movie: NoMovie
 ) -> Result:
-    """Design a free gradient index, evaluate and save it."""
+    """Design a free gradient index, and a surface with it if asked for; evaluate and save it."""
     chosen, lens, target = project.settings.design, project.settings.lens, problem.target.numpy()
     total, limit = chosen.iterations or problem.stages[-1].iterations, chosen.time_limit if time_limit is None else time_limit
     movie.begin(problem.scene)
@@ -295,6 +295,8 @@ def _run_index(
                 movie.record(now, target, project.settings.target.encoding, False)
 
             values, state = problem.iterate(lens, state, total, began.wall, limit, lambda: bool(asked), on_iteration)
+        if not asked and not chosen.iterations and state.reason in DONE:
+            state = replace(state, optimizer={})
         lens = lens.changed(index_file=attachments.index_attached(values))
         project = replace(project, settings=project.settings.changed(lens=lens))
         if project.path is not None:
