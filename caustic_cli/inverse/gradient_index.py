@@ -202,7 +202,8 @@ def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], lim
     if spread > (1.0 - 2.0 * INSIDE) * room:
         raise InputError(
             f"⟨lens.index_range⟩ spans {room:.3g}, and this picture requires an index that varies by {spread:.3g};"
-            f" a thickness of {(lens.offset.thickness - lens.z_in) * 1.1 * spread / room:.3g} mm, or a smaller ⟨mag⟩, needs no more"
+            f" a thickness of {(lens.offset.thickness - lens.z_in) * 1.1 * spread / room:.3g} mm, a smaller ⟨mag⟩, or"
+            " ⟨+lens.with_surface⟩ needs no more"
         )
     return layer
 

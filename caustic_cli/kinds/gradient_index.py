@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config.default_stages import refinement, transport_cells
+from caustic_cli.config.default_stages import Table, refinement, transport_cells
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
@@ -82,15 +82,20 @@ class IndexPlate(OneSurface):
             raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design.start}")
         cls.complete_surface(d)
         if "stages" not in design:
-            last = refinement(d.lens.control, d.rays, d.resolution, d.effort.refinement)[-1]
-            rays = d.rays or min(last["rays"], RAYS_BENT * math.prod(d.resolution))
-            d.set_stages([last | {"rays": rays, "oversample": min(4, last["oversample"]), "iterations": ITERATIONS}])
+            stage = cls.default_stage(d)
+            rays = d.rays or min(stage["rays"], RAYS_BENT * math.prod(d.resolution))
+            d.set_stages([stage | {"rays": rays, "oversample": min(4, stage["oversample"])}])
 
     @classmethod
     def complete_surface(cls, d: Defaults) -> None:
         """Complete how the exit is designed: it is flat, and the index starts from optimal transport."""
         d.set_design(start="offset")
         d.fill_design(preconditioner="laplacian")
+
+    @classmethod
+    def default_stage(cls, d: Defaults) -> Table:
+        """The stage unless it is given, before its rays are limited."""
+        return refinement(d.lens.control, d.rays, d.resolution, d.effort.refinement)[-1] | {"iterations": ITERATIONS}
 
     def iterate(
         self,
@@ -215,8 +220,12 @@ class GradedLens(IndexPlate):
         """It starts from optimal transport of the light that the initial index bends."""
         d.set_design(start="transport")
         cls.complete_control(d)
-        cls.creased(d, [])
         d.fill_design(preconditioner="none")
+
+    @classmethod
+    def default_stage(cls, d: Defaults) -> Table:
+        """With the net and the iterations of a surface alone."""
+        return cls.refinement(d, cls.creased(d, []))[-1]
 
     @cached_property
     def initial_index(self) -> Tensor:
