@@ -33,6 +33,7 @@ from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Evaluation
 from caustic_cli.inverse.parametrisation import FreeHeights
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.gradient.fields import SplineIndex
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
@@ -139,6 +140,7 @@ def design_graded_lens(
     iterations: int,
     seed: int = 0,
     limits: Limits | None = None,
+    how: LossImage | None = None,
     known: Mapping[str, Tensor] = MappingProxyType({}),
     on_iteration: Callable[[int, float, float, Tensor | None], None] = lambda k, loss, on_screen, image: None,
     stop: Callable[[], bool] = lambda: False,
@@ -148,7 +150,7 @@ def design_graded_lens(
     Args:
         scene: a plane wave, the lens and the screen; field: spline spaces of the exit.
         target: (n_x, n_y) irradiance on the screen's pixels.
-        rays: traced in each iteration; seed: of the rays; limits: of the surface.
+        rays: traced in each iteration; seed: of the rays; limits: of the surface; how: the image is rendered.
         known: the state of an earlier search, which is continued instead of one from `start`; empty for none.
         on_iteration, stop: as of `design_gradient_index`.
 
@@ -159,7 +161,7 @@ def design_graded_lens(
     refuse_index_design(scene, start.limits)
     if known:
         start = replace(start, **{name: known[name] for name in BEGUN})
-    objective = IndexObjective(scene, target, volume(scene, start.index), rays, seed, field, limits)
+    objective = IndexObjective(scene, target, volume(scene, start.index), rays, seed, field, limits, how)
     loss = JointLoss(objective, start)
     search = LBFGS(loss, torch.zeros(sum(loss.split), dtype=torch.float64))
     if known:

@@ -210,7 +210,7 @@ def _first_layer(scene: Scene, target: np.ndarray, control: tuple[int, int], lim
 
 class IndexObjective(Objective):
     """The loss as a function of the control values of the index, {name: (n, m, k)}; and of the heights of the exit, {EXIT: (n, m)}
-    mm, where its spline spaces are given, within `limits`."""
+    mm, where its spline spaces are given, within `limits`; how: the image is rendered, None as for a plate."""
 
     def __init__(
         self,
@@ -221,6 +221,7 @@ class IndexObjective(Objective):
         seed: int,
         exit: HeightField | None = None,
         limits: Limits | None = None,
+        how: LossImage | None = None,
     ):
         self.system = plate_system(scene, index, exit)
         self.name = index_name(self.system.elements[0])
@@ -233,7 +234,7 @@ class IndexObjective(Objective):
             sampler,
             torch.from_numpy(np.ascontiguousarray(target, dtype=np.float64)),
             "rms-light",
-            LossImage(apron=apron, oversample=OVERSAMPLE),
+            how or LossImage(apron=apron, oversample=OVERSAMPLE),
             limits,
             dtype=torch.float64,
         )

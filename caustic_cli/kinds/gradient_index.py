@@ -253,6 +253,7 @@ class GradedLens(IndexPlate):
             iterations=iterations,
             seed=self.options.seed,
             limits=self.options.limits,
+            how=self.stages[-1].rendering,
             known=state.optimizer,
             on_iteration=done,
             stop=stop,
