@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.optics.backends import backend_for
@@ -338,6 +339,35 @@ def test_taylor_through_the_system(source, tilt):
             rest.append(abs(float((moved.image * weights).sum() - begun.detach()) - e * slope))
         assert abs(np.polyfit(np.log(steps), np.log(rest), 1)[0] - 2.0) < 0.1, rest
         assert rest[-1] < 1e-2 * abs(steps[-1] * slope)
+
+
+@pytest.mark.parametrize("field", [volume((9, 8, 6)), Selfoc(1.6, 0.3), FishEye(1.7, 4.0)], ids=lambda f: type(f).__name__)
+def test_forward_mode_is_the_transpose_of_the_adjoint(field):
+    """<y, J t> = <J' y, t> for random y and t, by all that an integration depends on."""
+    generator = torch.Generator().manual_seed(3)
+
+    def random(count):
+        return [0.3 * torch.randn(40, generator=generator, dtype=D) for _ in range(count)]
+
+    point, time = random(3), 1.5 + random(1)[0]
+    inputs = [*point, *launched(field, point, [*random(2), torch.ones(40, dtype=D)]), time]
+    tangents, y = random(7), random(8)
+    c = None if field.shape is None else field.coefficients
+    free = [] if c is None else [c]
+    along = [0.1 * torch.randn(v.shape, generator=generator, dtype=D) for v in free]
+
+    def ends(values):
+        out = flow(field, values[7] if c is not None else None, values[:3], values[3:6], values[6], 4)
+        return [*out.point, *out.momentum, out.path, out.length]
+
+    leaves = [v.clone().requires_grad_() for v in (*inputs, *free)]
+    pulled = torch.autograd.grad(ends(leaves), leaves, y)
+    with forward_ad.dual_level():
+        duals = [forward_ad.make_dual(v, t) for v, t in zip((*inputs, *free), (*tangents, *along), strict=True)]
+        pushed = [forward_ad.unpack_dual(v).tangent for v in ends(duals)]
+    left = sum(float((a * b).sum()) for a, b in zip(y, pushed, strict=True))
+    right = sum(float((a * b).sum()) for a, b in zip(pulled, (*tangents, *along), strict=True))
+    assert left == pytest.approx(right, rel=1e-11)
 
 
 # In a system.

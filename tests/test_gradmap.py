@@ -10,12 +10,14 @@ from PIL import Image
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.gradient import RayFlow
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import SAMPLERS, Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, tracers
 from caustic_cli.scene import Component, Disc, FreeForm, Lens, Light, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.sources.several import Several
 from caustic_cli.studies import gradmap
 from caustic_cli.studies.gradmap import compare, difference_step, finite_difference, gradient_image, plot_gradient, shown_part
@@ -68,6 +70,11 @@ def test_dot_product_identity_with_reverse_mode(kind, filter):
         assert float((y * forward).sum()) == pytest.approx(float(pulled[control]), abs=1e-12 * scale)
 
 
+def volume(least: float, by: float) -> Gradient:
+    """Indices between `least` and `least` + 2 `by`."""
+    return Gradient("volume", volume=least + by * (1.0 + np.sin(np.arange(7.0 * 6 * 4)).reshape(7, 6, 4)))
+
+
 def scenes() -> dict[str, Scene]:
     """Scenes in which rays meet the exit elsewhere than where they are sampled, and others, by name."""
     scene, _, _ = bumpy()
@@ -86,6 +93,9 @@ def scenes() -> dict[str, Scene]:
         "tilted": replace(scene, source=point, screen=replace(screen, tilt=(20.0, -10.0))),
         "curved": replace(scene, screen=replace(screen, radius=(80.0, 80.0))),
         "two sides": replace(scene, lens=replace(lens, entrance=front)),
+        "radial index": replace(scene, lens=replace(lens, gradient=Gradient("radial", (-2e-3, 1e-5)))),
+        "rod": replace(scene, source=point, lens=replace(lens, gradient=Gradient("selfoc", (0.08,)), absorption=0.02)),
+        "index volume": replace(scene, source=point, lens=replace(lens, gradient=volume(1.5, 0.05))),
         "lens in front": replace(scene, elements=(Component(-12.0, (14.0, 14.0), 3.0, (60.0, -80.0)),)),
         "mirror": Scene(PlaneWave(), mirror, Screen((14.3, 11.7), -100.0, (23, 19))),
         "mirror, point": Scene(point, mirror, Screen((14.3, 11.7), -100.0, (23, 19))),
@@ -96,6 +106,7 @@ def scenes() -> dict[str, Scene]:
 @pytest.mark.parametrize("name", scenes())
 def test_rays_under_the_control_point_are_all_that_matter(name, kind, monkeypatch):
     """<y, J e_ij> = <J' y, e_ij> with all rays traced by the kernels; a few of them by plain torch are enough."""
+    monkeypatch.setattr(RayFlow, "steps_for", lambda *_: 8)  # otherwise some rays may need fewer steps than all
     scene, (_, _, heights) = scenes()[name], bumpy()
     field = HeightField.of(scene.lens)
     rays, traced = rays_of(scene, kind, 3000, 3), []
@@ -117,6 +128,27 @@ def test_rays_under_the_control_point_are_all_that_matter(name, kind, monkeypatc
         assert float((y * forward).sum()) == pytest.approx(float(leaf.grad[control]), abs=1e-11 * scale)
     differentiated = sum(count for count, gradient in traced if gradient)
     assert 0 < differentiated < 0.6 * 3 * rays.count * len(scene.bands)
+
+
+@pytest.mark.parametrize("name", ["radial index", "rod", "index volume"])
+def test_an_index_that_varies_against_central_differences(name, monkeypatch):
+    monkeypatch.setattr(RayFlow, "steps_for", lambda *_: 8)
+    scene, (_, _, heights) = scenes()[name], bumpy()
+    field, rays = HeightField.of(scene.lens), rays_of(scene, "stratified", 3000, 3)
+    for control in ((4, 3), (2, 5)):
+        gradient = gradient_image(scene, field, heights, control, sampler=rays, filter=COSINE)
+        found = compare(gradient, scene, field, heights, control, sampler=rays, filter=COSINE)
+        assert int((gradient != 0).sum()) > 20 and found.relative_error < 1e-7  # measured 1e-9
+
+
+def test_a_volume_of_one_index_has_the_derivative_of_glass():
+    scene, field, heights = bumpy()
+    rays = rays_of(scene, "stratified", 3000, 3)
+    gradients = [
+        gradient_image(replace(scene, lens=lens), field, heights, (4, 3), sampler=rays, filter=COSINE)
+        for lens in (scene.lens, replace(scene.lens, gradient=volume(scene.lens.index, 0.0)))
+    ]
+    assert float((gradients[1] - gradients[0]).norm()) < 1e-9 * float(gradients[0].norm())
 
 
 @pytest.mark.parametrize(("degree", "size"), [((3, 3), (3, 3)), ((3, 3), (11, 11)), ((5, 3), (3, 3))])

@@ -23,9 +23,8 @@ from importlib import import_module
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.backends import backend_for, primal
 from caustic_cli.optics.surfaces.base import SECOND, Surface, SurfaceIntersection
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
 from caustic_cli.schema import checks
@@ -86,27 +85,22 @@ def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tenso
     (ox, oy, oz), (dx, dy, dz) = origin, direction
     t = torch.where(valid, t, torch.zeros_like(t)).double()
     x, y, z_ray = ox + t * dx, oy + t * dy, (oz - middle) + t * dz
-    at = tuple(_primal(torch.as_tensor(c, dtype=torch.float64)).expand(t.shape) for c in (x, y))
+    at = tuple(primal(torch.as_tensor(c, dtype=torch.float64)).expand(t.shape) for c in (x, y))
     inside_x, inside_y = (c.clamp(-r, r) for c, r in zip(at, surface.half_size, strict=True))
     z, gx, gy = surface.evaluate(sag, inside_x, inside_y)
     if not torch.is_grad_enabled():
         return t, torch.where(valid, gx, torch.zeros_like(t)), torch.where(valid, gy, torch.zeros_like(t))
     with torch.no_grad():
         zxx, zxy, zyy = surface.at(sag if sag is None else sag.detach(), inside_x, inside_y, SECOND)
-        sx, sy = _primal(gx), _primal(gy)
-        fx, fy, fz = (_primal(torch.as_tensor(c, dtype=torch.float64)) for c in direction)
+        sx, sy = primal(gx), primal(gy)
+        fx, fy, fz = (primal(torch.as_tensor(c, dtype=torch.float64)) for c in direction)
         c = fz - sx * fx - sy * fy
         c = torch.where(c.abs() > LEAST_COSINE, c, torch.full_like(c, LEAST_COSINE))
     f = z_ray - z - sx * (x - at[0]) - sy * (y - at[1])
-    move = torch.where(valid, -(f - _primal(f)) / c, torch.zeros_like(t))
+    move = torch.where(valid, -(f - primal(f)) / c, torch.zeros_like(t))
     ax, ay = (x - at[0]) + move * fx, (y - at[1]) + move * fy  # 0 in value, with the derivative of the point
     none = torch.zeros_like(t)
     return (t + move, torch.where(valid, gx + zxx * ax + zxy * ay, none), torch.where(valid, gy + zxy * ax + zyy * ay, none))
-
-
-def _primal(value: Tensor) -> Tensor:
-    """The value without derivatives of either mode."""
-    return forward_ad.unpack_dual(value).primal.detach()
 
 
 @torch.no_grad()

@@ -219,6 +219,10 @@ class Tracer:
         """The direct light at every element; only of a tracer that tracks its rays."""
         return [*self._front.interactions, *self._interactions(parameters)]
 
+    def at(self, name: str, parameters: Parameters) -> Interaction:
+        """The direct light at the element of this name, behind the first free-form surface; nothing behind it is traced."""
+        return next(m for m in self._interactions(parameters) if m.element.name == name)
+
     def last(self, parameters: Parameters) -> Interaction:
         """The direct light at the last element."""
         return cast(Interaction, [self._front.behind, *self._interactions(parameters)][-1])  # a system has at least one element

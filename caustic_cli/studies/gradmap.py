@@ -7,8 +7,8 @@ Notation
 
 The rays are constants and J = sum over rays, so the derivative of the image is the sum of those of chunks.  Rays that meet the
 surface outside the support of N_i N_j have none at all: the kernels find where rays meet it, and plain torch, whose operations have
-a forward mode, traces and differentiates the few that are left.  A plane wave's rays behind a flat entrance are sampled on the
-surface itself.  Pixels that no ray under the basis function can reach stay exactly 0.
+a forward mode, traces and differentiates the few that are left, through a varying index step by step.  A plane wave's rays behind a
+flat entrance are sampled on the surface itself.  Pixels that no ray under the basis function can reach stay exactly 0.
 
 Shares that a ray keeps within the frame sum to its weight, so dJ/dP_ij sums to 0 where nothing is reflected and no ray
 crosses the frame's border.  Bincount has a derivative of 0 almost everywhere and is refused.
@@ -39,10 +39,7 @@ from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.scene.traits import Capability
 
-DERIVATIVE = Capability(
-    "gradmap",
-    {"gradient index": "the image's derivative by one height is taken of lenses of one index, and this one's varies"},
-)
+DERIVATIVE = Capability("gradmap", {})
 
 #: Neither the rays' way to the surface nor plain torch needs a fused kernel.
 STAGES = Requests(stages=True)
@@ -79,10 +76,8 @@ def gradient_image(
         dtype: precision of the ray arithmetic; chunks are summed in float64.
 
     Raises:
-        InputError: no such control point, a filter without a derivative, or a gradient index, for which only the reverse mode is
-            implemented.
+        InputError: no such control point, or a filter without a derivative.
     """
-    DERIVATIVE.refuse(scene)
     direction = _direction(field, control).to(sampler.device)
     refuse_steps(filter)
     heights = heights.detach().to(sampler.device, torch.float64)
@@ -272,8 +267,7 @@ def _under(
     if isinstance(rays, Sample) and scene.axial:
         return RayState.on_axis(_sampled_under(field, control, rays), pupil.half_size, pupil.z)
     state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
-    traced = Tracer(system, state, requests=STAGES)
-    x, y = traced.trace_element(traced.first, traced.start, heights).hit.local[:2]
+    x, y = Tracer(system, state, requests=STAGES).at(EXIT, {EXIT: heights}).hit.local[:2]
     in_u, in_v = in_support(field, control, *(0.5 * (c / r + 1.0) for c, r in zip((x, y), field.half_size, strict=True)))
     return state.only(in_u & in_v)
 

@@ -45,6 +45,18 @@ def in_forward_mode() -> bool:
     return forward_ad._current_level >= 0
 
 
+def primal(value: Tensor) -> Tensor:
+    """The value without derivatives of either mode."""
+    return forward_ad.unpack_dual(value).primal.detach()
+
+
+def differentiated(*values: Tensor) -> bool:
+    """Whether one of the values has derivatives, of either mode."""
+    if torch.is_grad_enabled() and any(value.requires_grad for value in values):
+        return True
+    return in_forward_mode() and any(forward_ad.unpack_dual(value).tangent is not None for value in values)
+
+
 def backend_for(device: torch.device | str):
     """The backend for tensors on `device`: the kernels on a CPU, the reference elsewhere and in forward mode."""
     kernels = os.environ.get("CAUSTIC_KERNELS", "")

@@ -35,6 +35,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.errors import CausticError
+from caustic_cli.optics.backends import in_forward_mode
 from caustic_cli.optics.gradient.fields import LEAST_SQUARE, IndexField, square_of
 
 _S4 = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
@@ -59,9 +60,10 @@ class Flow(NamedTuple):
 def flow(field: IndexField, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
     """Integrate rays over `time` (N,) mm of tau in equal steps; the plain-torch reference, for any field.
 
-    Differentiable once, in reverse mode, by coefficients, points, momenta and times.
+    Differentiable once by coefficients, points, momenta and times: in reverse mode by the adjoint, in forward mode step by step.
     """
-    out = _Flow.apply(field, steps, order, coefficients, time, *point, *momentum)
+    march = _marched if in_forward_mode() else _Flow.apply
+    out = march(field, steps, order, coefficients, time, *point, *momentum)
     return Flow(out[:3], out[3:6], out[6], out[7])
 
 
@@ -77,19 +79,24 @@ def kick(field: IndexField, coefficients, q, p, path: Tensor, length: Tensor, b)
     return p, path + 0.5 * b * square, length + b * square.clamp_min(LEAST_SQUARE).sqrt()
 
 
+def _marched(field: IndexField, steps: int, order: int, coefficients: Tensor | None, time: Tensor, *ray: Tensor):
+    """The steps of `flow`."""
+    q, p = ray[:3], ray[3:]
+    path, length, h = torch.zeros_like(q[0]), torch.zeros_like(q[0]), time / steps
+    for _ in range(steps):
+        for w in WEIGHTS[order]:
+            q, path = drift(q, p, path, 0.5 * w * h)
+            p, path, length = kick(field, coefficients, q, p, path, length, w * h)
+            q, path = drift(q, p, path, 0.5 * w * h)
+    return (*q, *p, path, length)
+
+
 class _Flow(torch.autograd.Function):
     """`flow` with inputs and outputs by components."""
 
     @staticmethod
     def forward(field, steps, order, coefficients, time, *ray):
-        q, p = ray[:3], ray[3:]
-        path, length, h = torch.zeros_like(q[0]), torch.zeros_like(q[0]), time / steps
-        for _ in range(steps):
-            for w in WEIGHTS[order]:
-                q, path = drift(q, p, path, 0.5 * w * h)
-                p, path, length = kick(field, coefficients, q, p, path, length, w * h)
-                q, path = drift(q, p, path, 0.5 * w * h)
-        return (*q, *p, path, length)
+        return _marched(field, steps, order, coefficients, time, *ray)
 
     @staticmethod
     def setup_context(ctx, inputs, output):

@@ -6,7 +6,8 @@ Notation, in addition to that of `integrator`
     delta   remaining step to the surface, from Newton's method for f(q(T + delta)) = 0
 
 T is a differentiable function of the ray.  If delta exceeds a step, T is increased by it; if the ray has turned away from the
-surface, T is halved.  This changes the steps but not the ray.  delta is differentiated at the root, d delta = -df / f'.
+surface, T is halved.  This changes the steps but not the ray.  delta is differentiated at the root, d delta = -df / f', in both
+modes.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.backends import differentiated, primal
 from caustic_cli.optics.gradient.fields import IndexField
 from caustic_cli.optics.gradient.integrator import ORDER, Flow, steps_for
 from caustic_cli.optics.surfaces.base import Surface
@@ -101,7 +103,7 @@ class NextSurface:
         (rx, ry) = surface.half_size
         within = (x.abs() <= rx) & (y.abs() <= ry)
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
-        height, gx, gy = (surface.at if torch.is_grad_enabled() and x.requires_grad else surface.evaluate)(self.heights, x, y)
+        height, gx, gy = (surface.at if differentiated(x) else surface.evaluate)(self.heights, x, y)
         return z - height, pz - gx * px - gy * py, (gx, gy), within
 
     def missing(self, rays: RayFlow, begin: Flow, near: float) -> tuple[Tensor, Tensor]:
@@ -115,16 +117,15 @@ class NextSurface:
             ok = ok & (self.side * rate > PARALLEL) & f.isfinite()
             if bool(((f.abs() <= near) | ~ok).all()):
                 break
-        return torch.where(ok, delta, torch.zeros_like(delta)), ok & (f.abs() <= 10.0 * near)
+        return primal(torch.where(ok, delta, torch.zeros_like(delta))), ok & (f.abs() <= 10.0 * near)
 
     def attached(self, rays: RayFlow, arrived: Flow, delta: Tensor, found: Tensor) -> Tensor:
         """delta, differentiated at the root where a derivative is wanted."""
-        by_rays = torch.is_grad_enabled() and any(t.requires_grad for t in (*arrived.point, *arrived.momentum))
-        if not by_rays and (self.heights is None or not self.heights.requires_grad):
+        if not differentiated(*arrived.point, *arrived.momentum, *([] if self.heights is None else [self.heights])):
             return delta
         f, rate, _, _ = self.above(rays.on(arrived.point, arrived.momentum, delta))
-        rate = torch.where(found, rate.detach(), torch.ones_like(rate))
-        return delta - torch.where(found, (f - f.detach()) / rate, torch.zeros_like(f))
+        rate = torch.where(found, primal(rate), torch.ones_like(rate))
+        return delta - torch.where(found, (f - primal(f)) / rate, torch.zeros_like(f))
 
 
 def transfer(rays: RayFlow, point, direction, ahead: NextSurface, steps: int | None = None) -> Transfer:
