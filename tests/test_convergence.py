@@ -16,7 +16,7 @@ from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import freeform_of
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
-from caustic_cli.studies import diffraction, intersection
+from caustic_cli.studies import intersection
 from caustic_cli.studies.convergence import FILTERS, run_study, single_precision
 from caustic_cli.studies.fit import knee, order, pareto
 from caustic_cli.studies.measurement import REFERENCE_FACTOR, Benchmark, Setting
@@ -286,10 +286,3 @@ def test_intersections_behind_a_free_form_entrance():
     case = intersection.of_lens(scene, HeightField.of(lens), torch.full((12, 12), 5.0, dtype=torch.float64), 500)
     x, y, z = case.rays.origin
     assert x.shape == y.shape == z.shape == case.rays.power.shape and float(z.std()) > 0
-
-
-def test_the_study_of_diffraction_refuses_what_it_does_not_scale():
-    lens = front(Lens(control=(12, 12), offset=Offset(5.0)))
-    scene = Scene(PlaneWave(), lens, Screen((30.0, 30.0), 300.0, (8, 8)))
-    with pytest.raises(InputError, match="one index with a flat entrance"):
-        diffraction.run_diffraction(scene, HeightField.of(lens), torch.full((12, 12), 5.0, dtype=torch.float64))

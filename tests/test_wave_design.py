@@ -25,15 +25,32 @@ from caustic_cli.inverse.constraints import Limits
 from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.wave_objective import WaveObjective
 from caustic_cli.kinds import OneSurface
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_magnification
 from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.project import completion
 from caustic_cli.project.project import Project
-from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import (
+    Component,
+    Disc,
+    FoldMirror,
+    FreeForm,
+    Lens,
+    Light,
+    Offset,
+    PlaneWave,
+    Points,
+    Scene,
+    Screen,
+    SecondTarget,
+)
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.light import WAVE_NODES
+from caustic_cli.scene.screen import Sags
 from caustic_cli.studies import diffraction
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.workflow import comparison
@@ -433,6 +450,54 @@ def test_a_scaled_lens_is_the_same_lens():
     assert larger.screen.pixel[0] == pytest.approx(10 * scene.screen.pixel[0])
     before = local_magnification(scene, HeightField.of(scene.lens), heights_of(scene))
     assert local_magnification(larger, field, heights) == pytest.approx(before, rel=1e-9)
+
+
+SAGS = Sags(0.5 * np.sin(np.arange(30.0)).reshape(6, 5), (5.0, 5.0))
+VOLUME = 1.5 + 0.02 * np.sin(np.arange(7.0 * 6 * 4)).reshape(7, 6, 4)
+
+
+def larger_scenes() -> dict[str, Scene]:
+    """Scenes of which everything has to be scaled, by name."""
+    scene = scene_of()
+    screen = scene.screen
+    gradients = (("selfoc", (0.1,)), ("radial", (-5e-3, 1e-4)), ("axial", (0.02, -3e-3)))
+    lens = Component(8.0, (6.0, 6.0), 2.0, (20.0, -30.0), absorption=0.02)
+    return {
+        **{kind: scene_of(gradient=Gradient(kind, terms)) for kind, terms in gradients},
+        "volume": scene_of(gradient=Gradient("volume", volume=VOLUME), absorption=0.05),
+        "two sides": replace(
+            scene_of(entrance=FreeForm(0.02 * np.sin(np.arange(42.0)).reshape(7, 6), (3, 3))), second_target=SecondTarget()
+        ),
+        "other elements": replace(scene, elements=(lens, FoldMirror(30.0, (9.0, 9.0), tilt=(45.0, 0.0)))),
+        "displaced": replace(scene, elements=(lens,), mounting=((0.1, -0.05), (0.5, 0.2))),
+        "mirrors alone": replace(scene, elements=(FoldMirror(30.0, (2.5, 2.5), tilt=(45.0, 0.0)),)).unfolded,
+        "sphere": replace(scene, screen=replace(screen, radius=(30.0, 30.0), shift=(0.3, -0.1))),
+        "measured shape": replace(scene, screen=replace(screen, sags=SAGS)),
+        "far field": replace(scene, screen=Screen((80.0, 80.0), 1000.0, (32, 32), far=True)),
+    }
+
+
+@pytest.mark.parametrize("name", larger_scenes())
+def test_a_scaled_scene_has_the_same_picture(name):
+    scene = larger_scenes()[name]
+    heights = heights_of(scene, 4e-3)
+    larger = diffraction.scaled(scene, HeightField.of(scene.lens), heights, 7.0)
+    before, after = (
+        expose(*one, rays_of(one[0], "stratified", 4000, 1), Filter("cosine", (3, 3))).image
+        for one in ((scene.onto(scene.screen), HeightField.of(scene.lens), heights), larger)
+    )
+    assert 0.2 < float(before.sum()) <= 1.0 and float((after - before).norm()) < 1e-7 * float(before.norm())
+
+
+@pytest.mark.parametrize("name", ["radial", "two sides", "other elements", "far field"])
+def test_study_of_diffraction_of_other_lenses(name, monkeypatch):
+    monkeypatch.setattr(diffraction, "SIZES", (2.0, 8.0))
+    monkeypatch.setattr(diffraction, "WAVELENGTHS", (800.0,))
+    monkeypatch.setattr(diffraction, "ANGLES", (0.6,))
+    scene = larger_scenes()[name]
+    study = diffraction.run_diffraction(scene, HeightField.of(scene.lens), heights_of(scene, 4e-3), rays=400_000)
+    small, large, red, wide = (row["error"] for row in study.rows)
+    assert large < small < red and wide < small
 
 
 def test_stages_on_rays_are_left_out_where_the_wave_image_is_refined(_here, capfd, monkeypatch):

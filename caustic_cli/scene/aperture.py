@@ -25,6 +25,11 @@ def _library(array) -> Any:
     return sys.modules[type(array).__module__]
 
 
+def larger(pair: tuple[float, float], factor: float) -> tuple[float, float]:
+    """Two lengths, mm, larger by a factor."""
+    return factor * pair[0], factor * pair[1]
+
+
 @dataclass(frozen=True)
 class Aperture:
     """The clear aperture of a surface: a rectangle centred on the element's axis; infinite for an unbounded surface."""
@@ -96,6 +101,10 @@ class Aperture:
         """The aperture with a border of a width, mm."""
         rx, ry = self.half_size
         return type(self)((rx + by, ry + by))
+
+    def scaled(self, factor: float) -> Aperture:
+        """The aperture larger by a factor."""
+        return type(self)(larger(self.half_size, factor))
 
     def chord(self, at: float, along: int) -> float:
         """Half the length, mm, of the line across the aperture along x (0) or y (1) at this distance from the axis."""

@@ -18,7 +18,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from caustic_cli.errors import InputError, at_least
-from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of
+from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of, larger
 from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.interaction import Reflecting, Refracting
 from caustic_cli.scene.materials import nearest_index
@@ -159,6 +159,19 @@ class Component:
     def axis_behind(self, leg: Any) -> Any:
         """The segment of the axis (`optics.frames.AxisSegment`) behind it, from that in front of it."""
         return leg
+
+    def scaled(self, factor: float) -> Component:
+        """The component larger by a factor, at as many times the distance."""
+        own, other = (None if surface is None else surface.scaled(factor) for surface in self.surfaces)
+        return replace(
+            self,
+            z=factor * self.z,
+            size=larger(self.size, factor),
+            thickness=factor * self.thickness,
+            radius=larger(self.radius, factor),
+            absorption=self.absorption / factor,
+            surfaces=(own, other),
+        )
 
     def at(self, wavelength: float) -> Component:
         """The component with its index evaluated at a wavelength, nm."""

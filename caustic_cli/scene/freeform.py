@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,10 @@ class FreeForm:
     #: As for `Lens`.
     degree: tuple[int, int]
     knots: tuple[Sequence[float], Sequence[float]] | None = None
+
+    def scaled(self, factor: float) -> FreeForm:
+        """Larger by a factor."""
+        return replace(self, heights=factor * self.heights)
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,11 @@ class Gradient:
         """The distribution in a lens whose index is larger by this: formulas are relative to that, a volume is not."""
         return self if self.volume is None else replace(self, volume=self.volume + by)
 
+    def scaled(self, factor: float) -> Gradient:
+        """The distribution n(q / factor) in a lens that is larger by this factor; a volume is over the lens."""
+        order = {"selfoc": lambda k: 1, "radial": lambda k: 2 * k, "axial": lambda k: k}.get(self.kind)
+        return self if order is None else replace(self, terms=tuple(t / factor ** order(k) for k, t in enumerate(self.terms, 1)))
+
     def __post_init__(self):
         if self.kind == "volume":
             object.__setattr__(self, "volume", checked_volume(self.volume))

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from caustic_cli.errors import InputError
-from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of
+from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of, larger
 from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.interaction import Interior, Reflecting, Refracting, interaction_of
@@ -259,6 +259,21 @@ class Lens:
     def denser(self, by: float) -> Lens:
         """The lens with an index that is larger by this everywhere."""
         return replace(self, index=self.index + by, gradient=None if self.gradient is None else self.gradient.denser(by))
+
+    def scaled(self, factor: float) -> Lens:
+        """The lens larger by a factor, with the same angles, index and transmittance."""
+        return replace(
+            self,
+            size=larger(self.size, factor),
+            z_in=factor * self.z_in,
+            min_thickness=factor * self.min_thickness,
+            offset=Offset(factor * self.offset.thickness, larger(self.offset.radius, factor)),
+            height_range=larger(self.height_range, factor),
+            absorption=self.absorption / factor,
+            border=factor * self.border,
+            entrance=None if self.entrance is None else self.entrance.scaled(factor),
+            gradient=None if self.gradient is None else self.gradient.scaled(factor),
+        )
 
     def height_bounds(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the control heights at control points x (n,), y (m,): two (n, m) float64, mm.

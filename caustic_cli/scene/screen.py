@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from caustic_cli.errors import InputError, at_least
-from caustic_cli.scene.aperture import Aperture
+from caustic_cli.scene.aperture import Aperture, larger
 from caustic_cli.schema.table import check_all, default
 
 #: Largest number of points of a measured shape along an axis.
@@ -61,6 +61,10 @@ class Sags:
         if not np.isfinite(self.values).all():
             raise InputError("⟨screen.shape_file⟩ must hold finite heights in mm")
 
+    def scaled(self, factor: float) -> Sags:
+        """Larger by a factor."""
+        return Sags(factor * self.values, larger(self.size, factor))
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sags) and self.values is other.values and self.size == other.size
 
@@ -80,6 +84,11 @@ class Window:
     vertex: Vector
     axes: tuple[Vector, Vector, Vector]
     opening: Aperture
+
+    def scaled(self, factor: float) -> Window:
+        """The opening larger by a factor, at as many times the distance."""
+        x, y, z = (factor * v for v in self.vertex)
+        return replace(self, vertex=(x, y, z), opening=self.opening.scaled(factor))
 
     def passed(self, origin: Sequence[Any], direction: Sequence[Any]) -> Any:
         """Whether straight rays pass it, (N,): three components of their origins, mm, and directions, each (N,) or a number."""
@@ -237,6 +246,20 @@ class Screen:
     def centre(self) -> Vector:
         """Its centre in the scene, mm."""
         return self.in_space((*self.shift, self.z))
+
+    def scaled(self, factor: float) -> Screen:
+        """The screen larger by a factor at as many times the distance, in the same directions: a far one is what it was."""
+        if self.far:
+            return self
+        return replace(
+            self,
+            size=larger(self.size, factor),
+            z=factor * self.z,
+            shift=larger(self.shift, factor),
+            radius=larger(self.radius, factor),
+            sags=None if self.sags is None else self.sags.scaled(factor),
+            windows=tuple(window.scaled(factor) for window in self.windows),
+        )
 
     def in_space(self, own: Vector) -> Vector:
         """A vector in the scene, from its components along the axes of the screen before its tilt; and the other way round."""

@@ -197,9 +197,7 @@ class DiffractionStudy(StudyKind):
 
     name, home, unit, takes = "diffraction", "diffraction", "cases", ("dtype",)
 
-    @property
-    def unsupported(self) -> Mapping[str, str]:  # type: ignore[override]
-        return {**super().unsupported, **self.module.DIFFRACTION.unsupported}
+    unsupported: Mapping[str, str] = {}
 
     def run(self, asked: StudyRequest) -> Study:
         from caustic_cli.workflow.comparison import lens_of_disc  # noqa: PLC0415
