@@ -47,6 +47,7 @@ from caustic_cli.scene.traits import TRAITS, Capability
 from caustic_cli.schema.table import TABLE
 from caustic_cli.studies.gradmap import gradient_image
 from caustic_cli.studies.manufacture import manufacture
+from caustic_cli.studies.shop_page import write_page
 from caustic_cli.workflow.capabilities import capabilities
 from caustic_cli.workflow.export import _arguments, _home
 
@@ -159,6 +160,12 @@ def reported(scene, path):
     manufacture(scene, *surface(scene))
 
 
+def shopped(scene, path):
+    CAPABILITIES["page for the shop"].refuse(scene)
+    report = manufacture(scene, *surface(scene))
+    write_page(path.with_suffix(".html"), "part", scene, *surface(scene), report, "", (50.0, 40.0), 0, True)
+
+
 def imaged(scene, path):
     """Refuse where the plan does not have diffraction by what the scene is."""
     decision = compile_plan(scene, *surface(scene))["diffraction"]
@@ -174,6 +181,7 @@ USED = {f"export to {format}": (lambda scene, path, format=format: exported(scen
     "script for LightTools": scripted,
     "gradmap": derived,
     "manufacturing report": reported,
+    "page for the shop": shopped,
     "wave image": imaged,
 }
 

@@ -42,6 +42,16 @@ class Gradient:
         """The distribution in a lens whose index is larger by this: formulas are relative to that, a volume is not."""
         return self if self.volume is None else replace(self, volume=self.volume + by)
 
+    def words(self, index: float) -> str:
+        """The distribution in words, in a lens of this index."""
+        if self.volume is not None:
+            return f"control values of a B-spline over aperture and thickness, {' x '.join(map(str, self.volume.shape))}"
+        if self.kind == "selfoc":
+            return f"n^2 = {index:g}^2 (1 - ({self.terms[0]:g} r)^2), r in mm from the axis"
+        by, each, origin = ("z", 1, "entrance") if self.kind == "axial" else ("r", 2, "axis")
+        terms = "".join(f" {'-' if t < 0 else '+'} {abs(t):g} {by}^{each * k}" for k, t in enumerate(self.terms, 1))
+        return f"n = {index:g}{terms}, {by} in mm from the {origin}"
+
     def scaled(self, factor: float) -> Gradient:
         """The distribution n(q / factor) in a lens that is larger by this factor; a volume is over the lens."""
         order = {"selfoc": lambda k: 1, "radial": lambda k: 2 * k, "axial": lambda k: k}.get(self.kind)

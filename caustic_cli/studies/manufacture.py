@@ -82,9 +82,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     found |= {"mass_g": None if density is None else found["volume_cm3"] * density} | side
     if lens.entrance is not None:
         fixed = entrance_of(lens)
-        _, *derivatives = sampled(fixed.field, fixed.heights, [_points(s) for s in fixed.field.spaces])
-        inside = _within(lens.opening, derivatives[0])
-        found["entrance"] = _shape(fixed.field, fixed.heights, derivatives, inside, -1)
+        found["entrance"] = shape_of(fixed.field, fixed.heights, lens.opening, -1)
     if tool_radius is not None:
         radii = [one["smallest_concave_radius_mm"] for one in (side, found.get("entrance", side))]
         found |= {"tool_radius_mm": tool_radius, "tool_fits": all(radius is None or radius >= tool_radius for radius in radii)}
@@ -108,6 +106,12 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         "index_error_of_a_pixel": pixel / by_index if by_index > 0 else None,
     }
     return found | dict.fromkeys(NOT_OF[lens.kind])
+
+
+def shape_of(field: HeightField, heights: Tensor, opening: Aperture, cut_from: int) -> dict[str, Any]:
+    """Slopes and concave radii, as of `manufacture`, of a free-form side that is cut from +z (1) or from -z (-1)."""
+    _, *derivatives = sampled(field, heights, [_points(s) for s in field.spaces])
+    return _shape(field, heights, derivatives, _within(opening, derivatives[0]), cut_from)
 
 
 def _shape(field: HeightField, heights: Tensor, derivatives: list[Tensor], inside: Tensor, cut_from: int) -> dict[str, Any]:
@@ -245,21 +249,28 @@ def _steepest_incidence(scene: Scene, field: HeightField, heights: Tensor, seed:
 def _moved(scene: Scene, other: Scene, field: HeightField, heights: Tensor, seed: int, further: float) -> float:
     """RMS distance on the screen, mm, between the landing points of the same rays in two scenes, the second screen `further` mm
     away."""
+    return apart(_landings(scene, field, heights, seed, 0.0), _landings(other, field, heights, seed, further))
+
+
+def apart(before: list[RayState], after: list[RayState]) -> float:
+    """RMS distance on the screen, mm, between two landing points of each ray, over the light that arrives at both."""
     total = power = 0.0
-    for one, two in zip(_landings(scene, field, heights, seed, 0.0), _landings(other, field, heights, seed, further), strict=True):
+    for one, two in zip(before, after, strict=True):
         weight = torch.where(two.power > 0, one.power, 0.0)
-        apart = sum((a - b) ** 2 for a, b in zip(one.origin[:2], two.origin[:2], strict=True))
-        total += float((weight * apart).nan_to_num(0.0).sum())
+        squares = sum((a - b) ** 2 for a, b in zip(one.origin[:2], two.origin[:2], strict=True))
+        total += float((weight * squares).nan_to_num(0.0).sum())
         power += float(weight.sum())
     return math.sqrt(total / power) if power > 0 else 0.0
 
 
 def _landings(scene: Scene, field: HeightField, heights: Tensor, seed: int, further: float) -> list[RayState]:
-    system, screen = (
-        System.of(scene, field),
-        scene.screen if scene.screen.far else replace(scene.screen, z=scene.screen.z + further),
-    )
-    return [Tracer(system, rays).land({EXIT: heights}, screen)[0] for rays in _rays(scene, seed)]
+    screen = scene.screen if scene.screen.far else replace(scene.screen, z=scene.screen.z + further)
+    return landings(replace(scene, screen=screen), System.of(scene, field), heights, seed)
+
+
+def landings(scene: Scene, system: System, heights: Tensor, seed: int) -> list[RayState]:
+    """Rays of a scene on its screen, behind a system with these heights (n, m) mm of the exit."""
+    return [Tracer(system, rays).land({EXIT: heights}, scene.screen)[0] for rays in _rays(scene, seed)]
 
 
 def _rays(scene: Scene, seed: int):

@@ -248,9 +248,3 @@ class Output:
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
         """Print its figures, from those of the render; say: with `table` and `result`, as of the command line."""
-
-
-def single(name: str, option: str) -> Capability:
-    """A capability for single lenses of uniform index with a flat entrance alone; option: that asks for it."""
-    message = f"⟨{option}⟩ supports lenses of uniform index with a flat entrance, and this one has {{}}"
-    return Capability(name, dict.fromkeys(("other elements", "two sides", "gradient index"), message))

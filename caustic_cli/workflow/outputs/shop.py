@@ -10,8 +10,9 @@ from caustic_cli.io.files import destination
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies import manufacture, shop_page
 from caustic_cli.studies.photograph.card import write_card
-from caustic_cli.workflow.outputs.base import Output, Place, Rendering, single
+from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 from caustic_cli.workflow.outputs.test_card import TestCard
+from caustic_cli.workflow.photographs import PHOTOGRAPHS
 
 
 @dataclass(eq=False)
@@ -19,9 +20,7 @@ class ShopPage(Output):
     """The page at `shop`; beside it NAME-card.png and NAME-card.csv."""
 
     option: ClassVar[str] = "shop"
-    capability: ClassVar[Capability] = Capability(
-        "page for the shop", {**TestCard.capability.unsupported, **single("page for the shop", "shop").unsupported}
-    )
+    capability: ClassVar[Capability] = Capability("page for the shop", TestCard.capability.unsupported)
     beyond: ClassVar[bool] = True
 
     shop: Path
@@ -33,12 +32,13 @@ class ShopPage(Output):
         return (self.shop, *(self.shop.with_name(f"{self.shop.stem}-card{suffix}") for suffix in (".png", ".csv")))
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
-        """shop: page and card, and the limits of `studies.shop_page`."""
+        """shop: page and card, and the limits of `studies.shop_limits`."""
         lens, (page, sheet, table) = rendering.designed, self.paths(rendering.place)
         report = manufacture.manufacture(lens.scene, *lens.made, seed=rendering.seed)
         card = write_card(sheet, table, lens.scene.screen.half_size, lens.scene.screen.shift)
         title, finish = rendering.place.lens.resolve().stem, lens.project.settings.lens.finish if lens.project else ""
-        limits = shop_page.write_page(page, title, lens.scene, *lens.made, report, finish, card)
+        judged = PHOTOGRAPHS.supports(lens.scene)
+        limits = shop_page.write_page(page, title, lens.scene, *lens.made, report, finish, card, rendering.seed, judged)
         return {"shop": {"page": str(page), "card": str(sheet)} | limits}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
