@@ -74,10 +74,12 @@ Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class InitialSurface:
-    """An initial surface: control heights (n, m) mm float64, and its vertex height, mm, where that was chosen (near sources)."""
+    """An initial surface: control heights (n, m) mm float64, its vertex height, mm, where that was chosen (near sources), and the
+    part of the light that its transport left in wrong places (`transport`, e)."""
 
     heights: Tensor
     middle: float | None = None
+    misplaced: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,14 +324,15 @@ def first_surface(
             z = found.heights
         if times > 1:
             grid, z = grid.sharper(found, directions, times)
-        return InitialSurface(net_of(*grid.places, z, field))
+        return InitialSurface(net_of(*grid.places, z, field), misplaced=0.0 if found is None else found.transport.error)
     found, grid = _near_surface(grid, cells, fixed, began + seconds, few, options)
     z = found.z
     if times > 1:
         grid, z = grid.sharper(found.mapped, found.directions, times)
         z = z + found.middle - _middle(z)
     net = net_of(*grid.places, np.maximum(z, grid.floor), field)
-    return InitialSurface(net.clamp_min(grid.floor), found.middle)  # the spline undershoots at a kink
+    net = net.clamp_min(grid.floor)  # the spline undershoots at a kink
+    return InitialSurface(net, found.middle, found.mapped.transport.error)
 
 
 def _near_surface(grid: _Grid, cells: int, fixed: bool, end: float, few: int, options: dict) -> tuple[_TruncatedSurface, _Grid]:

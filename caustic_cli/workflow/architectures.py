@@ -131,7 +131,8 @@ class _Study:
         self.over = project.over
         self.problem, self.first = problem_of(project, device), None
         if self.over is not None and chosen.start != "offset":
-            _, self.problem, self.first = first_heights(project, {"lens": dict(project.settings.lens)}, self.problem)
+            prepared = first_heights(project, {"lens": dict(project.settings.lens)}, self.problem)
+            self.problem, self.first = prepared.problem, prepared.first
         scene, stages, own = self.problem.scene, [s for s in self.problem.stages if not s.waves], self.problem.options
         if not stages:
             raise InputError(ONE_SIDE)

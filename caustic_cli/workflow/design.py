@@ -72,7 +72,7 @@ def design(
 
     A finished design found by `prepare` is returned; an unfinished one is continued.
     """
-    project, problem, first = prepared
+    project, problem, first = prepared.project, prepared.problem, prepared.first
     if problem is None:
         return _again(project, device, say, began, movie, aim)
     with project.hold:
@@ -140,7 +140,8 @@ def resume(
         if has_checkpoint:
             state = checkpoint.state
         else:
-            state = designer.initial_state(*designer.initial_heights(solved(project, problem, fixed=True)[0]) or ())
+            first = solved(project, problem, fixed=True)
+            state = designer.initial_state(*designer.initial_heights(None if first is None else first.heights) or ())
         _refuse_edited(project, designer, state)
         state = designer.restored(state)
         if iterations is not None:

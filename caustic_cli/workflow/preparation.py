@@ -14,6 +14,7 @@ import torch
 from caustic_cli.config.settings import Given, build_lens
 from caustic_cli.errors import InputError, at_most
 from caustic_cli.inverse.designer import Designer, InitialHeights
+from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.reachability import largest_magnification
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.io.files import Piped
@@ -35,15 +36,18 @@ surfaces = OnDemand("caustic_cli.io.surfaces")
 
 #: Most of a time limit for the initial surface.
 START_PART = 0.3
+#: Part of the light in wrong places after a transport from which it is said: one that converges leaves at most a hundredth.
+MISPLACED = 0.03
 
 
 class PreparedDesign(NamedTuple):
-    """A design about to be run: its project, its problem, None where it exists already, and its initial heights, None for the
-    offset surface."""
+    """A design about to be run: its project, its problem, None where it exists already, its initial heights, None for the offset
+    surface, and the part of the light that their transport left in wrong places."""
 
     project: Project
     problem: OneSurface | None = None
     first: InitialHeights | None = None
+    misplaced: float = 0.0
 
     @property
     def scene(self) -> Scene:
@@ -101,6 +105,11 @@ def prepare(
             most = min(most or 0.0, TABLE["mag"].high)
             within = f"; ⟨+mag⟩ of at most about {at_most(most, 2)} is within reach at this throw" if most else ""
             raise InputError(f"{error}{within}") from error
+    if prepared.misplaced > MISPLACED:
+        say.say(
+            f"the transport left {prepared.misplaced:.1%} of the light in wrong places: the design starts from a poorer surface"
+            " than usual, and may end with a larger error"
+        )
     if out is not None:
         directory.create(prepared.project, force)
     return prepared
@@ -115,27 +124,34 @@ def first_heights(project: Project, said: Given, problem: OneSurface) -> Prepare
     """
     fixed = "thickness" in said.get("lens", {})
     plate = problem.adapts and not fixed and _is_plate(project.settings.lens)
-    first, middle = solved(project, problem, fixed, rough=plate)  # of a plate the surface is solved again, for its thickness
-    if not problem.adapts:
-        return PreparedDesign(project, problem, Designer(problem).initial_heights(first))
-    if plate and first is not None:
+    first = solved(project, problem, fixed, rough=plate)  # of a plate the surface is solved again, for its thickness
+    if first is None or not problem.adapts:
+        return _prepared(project, problem, first)
+    middle = first.middle
+    if plate:
         thickness = project.settings.lens.thickness if middle is None else middle
-        if (spare := _spare(project.settings.lens, said, first)) > 0:
+        if (spare := _spare(project.settings.lens, said, first.heights)) > 0:
             project, problem = _with_lens(project, problem, thickness=thickness - spare)
-        first, middle = solved(project, problem, fixed=spare > 0)
-        middle = thickness - spare if spare > 0 else middle
+        first = solved(project, problem, fixed=spare > 0) or first
+        middle = thickness - spare if spare > 0 else first.middle
     if middle is not None:
         project, problem = _with_lens(project, problem, thickness=middle)
-    if first is not None and (room := _room(project.settings.lens, said, first)):
+    if room := _room(project.settings.lens, said, first.heights):
         project, problem = _with_lens(project, problem, **room)
         if middle is None:
-            first, _ = solved(project, problem, fixed)
-    return PreparedDesign(project, problem, Designer(problem).initial_heights(first))
+            first = solved(project, problem, fixed)
+    return _prepared(project, problem, first)
 
 
-def solved(project: Project, problem: OneSurface, fixed: bool, rough: bool = False) -> tuple[torch.Tensor | None, float | None]:
-    """Initial heights on the control net of the first stage, by transport or from another lens, None for the offset surface as it
-    is; and the thickness that belongs to them, None if unchanged.
+def _prepared(project: Project, problem: OneSurface, first: InitialSurface | None) -> PreparedDesign:
+    """A design that starts from a surface."""
+    heights, misplaced = (None, 0.0) if first is None else (first.heights, first.misplaced)
+    return PreparedDesign(project, problem, Designer(problem).initial_heights(heights), misplaced)
+
+
+def solved(project: Project, problem: OneSurface, fixed: bool, rough: bool = False) -> InitialSurface | None:
+    """The initial surface on the control net of the first stage, by transport or from another lens; None for the offset surface as
+    it is.
 
     fixed: the thickness is given by the user; a transport surface below the least thickness is raised, which leaves slopes
     unchanged; rough: by few cells, for its depth alone.
@@ -145,13 +161,13 @@ def solved(project: Project, problem: OneSurface, fixed: bool, rough: bool = Fal
     """
     start = project.settings.design.start
     if start == "offset":
-        return problem.offset(), None
+        heights = problem.offset()
+        return None if heights is None else InitialSurface(heights)
     if start == "transport":
-        surface = problem.transport(fixed, START_PART * project.settings.design.time_limit, rough)
-        return surface.heights, surface.middle
+        return problem.transport(fixed, START_PART * project.settings.design.time_limit, rough)
     net = problem.field(0)
     if Path(start).suffix.lower() in surfaces.SUFFIXES and not Path(start).is_dir():
-        return surfaces.onto(*surfaces.read_surface(start, net.half_size), net), None
+        return InitialSurface(surfaces.onto(*surfaces.read_surface(start, net.half_size), net))
     if not is_project(Path(start)):
         raise InputError(
             "⟨design.start⟩ must be transport, offset, a project directory or a lens surface"
@@ -162,7 +178,7 @@ def solved(project: Project, problem: OneSurface, fixed: bool, rough: bool = Fal
     sizes = [list(one.settings.lens.size) for one in (other, project)]
     if sizes[0] != sizes[1]:
         raise InputError(f"⟨design.start⟩: the lens of {start} is {sizes[0]} mm, not {sizes[1]} mm")
-    return surfaces.onto(field, heights, net), None
+    return InitialSurface(surfaces.onto(field, heights, net))
 
 
 def _with_lens(project: Project, problem: OneSurface, **values: Any) -> tuple[Project, OneSurface]:
