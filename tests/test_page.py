@@ -25,7 +25,8 @@ from caustic_cli.io.files import is_ours
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Disc, Lens, PlaneWave, Scene, Screen
+from caustic_cli.scene import Disc, FreeForm, Lens, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.screen import Sags
 from caustic_cli.scene.sources.several import light_of_all, together
 from caustic_cli.studies.metrics import relative_rms
 
@@ -302,6 +303,86 @@ def test_light_leans_from_its_own_direction(tmp_path):
     wanted = expose(leaning, field, z, rays_of(leaning, "stratified", 1_000_000)).image.numpy()
     found = by_node(tmp_path / "page.html", lit.screen.z, (0.0, 4.0))
     assert relative_rms(found, wanted) < ALIKE < relative_rms(found, by_node(tmp_path / "page.html", lit.screen.z))
+
+
+def hollow(rough: float = 0.004) -> FreeForm:
+    """An entrance on which every axis, sign and size matters: a tilted, astigmatic bowl with a relief."""
+    x, y = (np.linspace(-1.0, 1.0, n) for n in (11, 10))
+    bowl = 0.25 * x[:, None] ** 2 - 0.15 * y[None, :] ** 2 + 0.08 * x[:, None] - 0.05 * y[None, :]
+    return FreeForm(bowl + rough * np.random.default_rng(3).standard_normal(bowl.shape), (3, 3))
+
+
+SPREAD, NEAR = PlaneWave(tilt=(20.0, -12.0)), Points(((1.0, -2.0, -40.0),))
+SQUARE = at_angle((0.0, 0.0))
+FRONTED = replace(SQUARE, lens=replace(SQUARE.lens, entrance=hollow(), fresnel="exact", absorption=0.02))
+ASLANT = at_angle(SPREAD.tilt, wide=44.0)
+FAR = Screen((120.0, 96.0), 1000.0, (40, 32), far=True)
+ASIDE = replace(FAR, tilt=(5.0, 3.0, 20.0), shift=(-60.0, -100.0))
+BENT = replace(SQUARE.screen, size=(36.0, 33.0), shift=(1.0, -2.0), tilt=(12.0, -8.0))
+WAVY = 1.5 * np.sin(np.linspace(-3.0, 2.0, 33))[:, None] * np.cos(np.linspace(-1.0, 3.0, 29))
+#: Scenes, and each with one of its parts left out or wrong, whose image is another.
+BEYOND = {
+    "free-form entrance": (FRONTED, replace(FRONTED, lens=replace(FRONTED.lens, entrance=None))),
+    "free-form entrance, at an angle": (
+        replace(ASLANT, lens=replace(ASLANT.lens, entrance=hollow())),
+        replace(ASLANT, lens=replace(ASLANT.lens, entrance=hollow(0.0))),
+    ),
+    "free-form entrance, source nearby": (replace(FRONTED, source=NEAR), replace(FRONTED, source=Points(((-1.0, -2.0, -40.0),)))),
+    "free-form entrance, round": (
+        replace(FRONTED, lens=replace(FRONTED.lens, size=(10.0, 10.0), aperture="circle")),
+        replace(FRONTED, lens=replace(FRONTED.lens, size=(10.0, 10.0))),
+    ),
+    "far field": (replace(SQUARE, screen=FAR), replace(SQUARE, screen=replace(FAR, far=False))),
+    "far field, turned and at an angle": (
+        replace(SQUARE, source=PlaneWave(tilt=(6.0, -4.0)), screen=ASIDE),
+        replace(SQUARE, source=PlaneWave(tilt=(6.0, -4.0)), screen=replace(ASIDE, tilt=(5.0, 3.0))),
+    ),
+    "far field of both sides, source nearby": (
+        replace(FRONTED, source=NEAR, screen=replace(FAR, size=(500.0, 400.0))),
+        replace(FRONTED, source=Points(((1.0, -2.0, -50.0),)), screen=replace(FAR, size=(500.0, 400.0))),
+    ),
+    "far field, mirror": (
+        replace(SQUARE, lens=replace(SQUARE.lens, mirror=True), screen=replace(FAR, z=-1000.0)),
+        replace(SQUARE, lens=replace(SQUARE.lens, mirror=True), screen=replace(FAR, z=-1000.0, far=False)),
+    ),
+    "sphere": (replace(SQUARE, screen=replace(BENT, radius=(40.0, 40.0))), replace(SQUARE, screen=BENT)),
+    "dome": (replace(SQUARE, source=NEAR, screen=replace(BENT, radius=(-30.0, -30.0))), replace(SQUARE, source=NEAR, screen=BENT)),
+    "cylinder": (
+        replace(SQUARE, screen=replace(BENT, radius=(25.0, math.inf))),
+        replace(SQUARE, screen=replace(BENT, radius=(math.inf, 25.0))),
+    ),
+    "measured shape": (
+        replace(SQUARE, screen=replace(BENT, sags=Sags(WAVY, BENT.size))),
+        replace(SQUARE, screen=replace(BENT, sags=Sags(WAVY[::-1].copy(), BENT.size))),
+    ),
+}
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's functions")
+@pytest.mark.parametrize("name", BEYOND)
+def test_both_sides_far_fields_and_curved_screens_are_traced_as_render_does(name, tmp_path):
+    """The image is that of `expose`, not one that is mirrored, a pixel aside or of a scene that differs in one thing."""
+    scene, other = BEYOND[name]
+    field, z = HeightField.of(scene.lens), heights(0.02 if scene.screen.far else 0.01)
+    write_page(tmp_path / "page.html", scene, field, z)
+    wanted, wrong = (expose(s, field, z, rays_of(s, "stratified", 300_000)).image.numpy() for s in (scene, other))
+    found = by_node(tmp_path / "page.html", scene.screen.z)
+    assert wanted.sum() > 0.2 and found.sum() == pytest.approx(wanted.sum(), rel=0.005)
+    assert relative_rms(found, wanted) < ALIKE / 2
+    for another in (wrong, wanted[::-1], wanted[:, ::-1], np.roll(wanted, 1, 0), np.roll(wanted, 1, 1)):
+        assert relative_rms(another, wanted) > 2 * ALIKE
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
+@pytest.mark.parametrize("name", ["free-form entrance, at an angle", "far field of both sides, source nearby", "dome"])
+def test_the_graphics_processor_traces_them_as_the_processor_does(name, tmp_path):
+    scene, _ = BEYOND[name]
+    field, z, page = HeightField.of(scene.lens), heights(0.01), tmp_path / "page.html"
+    wanted = expose(scene, field, z, rays_of(scene, "stratified", 300_000)).image.numpy()
+    write_page(page, scene, field, z, wanted)
+    (image, said), document = traced(page, "", "gpu", tmp_path / "profile"), browsed(page, "", "cpu", tmp_path / "profile")
+    assert relative_rms(image.reshape(wanted.shape), wanted) < ALIKE / 2 and said < ALIKE / 2
+    assert bool(re.search(r'id="throw-control"[^>]* hidden', document)) == scene.screen.far
 
 
 def test_sources_of_which_one_has_no_colour_are_shown_in_grey():

@@ -1,6 +1,7 @@
 """Lenses with two free-form sides: initial surfaces, loss, design, a second picture or ray directions, files."""
 
 import json
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -233,7 +234,11 @@ def test_design_render_resume_and_files(_here, capfd):
     assert volume == pytest.approx(np.trapezoid(np.trapezoid(top - low, line), line), rel=1e-3)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
-    assert "entrance" in run(capfd, "render", "p", "--html", "page.html", "--quiet", "--force", code=2)
+    run(capfd, "render", "p", "--html", "page.html", "--rays", "20000", "--effects", "entrance", "--quiet", "--json", "--force")
+    page = Path("page.html").read_text()
+    assert "free-form on both sides" in page
+    wall = float(re.search(r">Wall<.*?>([0-9.]+) mm", page)[1])
+    assert wall == pytest.approx((top - low).min(), abs=1e-3)
     assert "holds one free-form side" in run(capfd, "export", "p", "--format", "zemax", code=2)
 
 

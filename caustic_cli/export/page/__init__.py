@@ -1,9 +1,9 @@
 """Self-contained HTML page with a ray tracer for a lens: `page.html`, `page.css` and `page.js` with the data of lens, light and
 screen.
 
-The page holds heights and slopes of the exit surface on a regular grid, and traces rays in the browser, offline.  Values are
-quantised to 16 bits between the least and the largest: one quantum of a slope displaces light by 1/65,535 of the range of all
-slopes, far less than a pixel.
+The page holds heights and slopes of the free-form surfaces, and of a curved screen over its tangent plane, on regular grids, and
+traces rays in the browser, offline.  Values are quantised to 16 bits between the least and the largest: one quantum of a slope
+displaces light by 1/65,535 of the range of all slopes, far less than a pixel.
 
 Notation
     c[i, j]     codes, i along +x and j along +y; stored as their differences along both axes, modulo 2^16, for compression
@@ -29,12 +29,14 @@ import torch
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.export.surface import sample_grid
+from caustic_cli.export.surface import SurfaceGrid, sample_grid
 from caustic_cli.io.colorimetry import rgb_matrix
 from caustic_cli.io.files import CREATED_BY, write_bytes
 from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.resampling import resampled
+from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Lens, Scene, Screen, Source
 from caustic_cli.scene.traits import Capability
 
@@ -45,6 +47,8 @@ COARSEST = 32
 MOST, MOST_CLOUD = 5_000_000, 3_400_000
 #: Compression level; the highest takes twenty times as long for 2 % of the size.
 LEVEL = 6
+#: Points along each axis of the shape of a curved screen.
+SHAPE = 257
 #: Pixels of the page's screen across, at most; a finer target is averaged down to them.
 PIXELS = 512
 #: Most positions of a source; more are subsampled evenly.
@@ -62,6 +66,7 @@ TRACED = frozenset(
         "fresnel",
         "total-reflection",
         "mirror",
+        "screen-shape",
         "screen-tilt",
         "screen-shift",
         "dispersion",
@@ -76,11 +81,8 @@ FILE = (
 PAGE = Capability(
     "interactive page",
     {
-        "far field": "⟨html⟩: the page traces light to screens at a distance, and this picture is in the far field",
-        "curved screen": "⟨html⟩: the page traces light to plane screens, not to curved ones",
         "gradient index": "⟨html⟩: the page traces lenses of one index, and this one's varies",
         "other elements": "⟨html⟩: the page traces a single lens, and this scene has [[element]] tables",
-        "two sides": "⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form",
         "ray file": FILE,
         "ray file among sources": FILE,
     },
@@ -136,7 +138,7 @@ def write_page(
     }
     for cells in CELLS:
         cloud = _cloud(scene, field, heights, cells)
-        if sum(len(part["data"]) for part in cloud.values() if part) <= MOST_CLOUD or cells == CELLS[-1]:
+        if _length(cloud) <= MOST_CLOUD or cells == CELLS[-1]:
             break
     page = _assembled(words, data | {"cloud": cloud}).encode()
     assert len(page) <= MOST, len(page)
@@ -157,7 +159,8 @@ def _lens(lens: Lens) -> dict:
 
 def _screen(scene: Scene) -> dict:
     """The screen: x, y and z of its centre, the light's way along x and y for each mm along z, by which it moves with its distance,
-    its lowest corner from the centre, its axes, and whether its normal is along the light."""
+    its lowest corner from the centre, its axes, whether its normal is along the light, the focal length of a far one, mm, 0 for
+    others, the unit of its lengths, and its shape."""
     screen, (x, y, z) = scene.screen, scene.undeviated
     return {
         "z": screen.z,
@@ -168,7 +171,16 @@ def _screen(scene: Scene) -> dict:
         "resolution": list(screen.resolution),
         "axes": [list(axis) for axis in screen.axes],
         "facing": sum(map(mul, scene.undeviated, screen.axes[2])) > 0,
+        "focal": abs(screen.z) if screen.far else 0.0,
+        "unit": screen.unit,
+        "shape": _shape(screen) if screen.curved else None,
     }
+
+
+def _shape(screen: Screen) -> dict:
+    """Heights and slopes of a curved screen over its tangent plane, on a regular grid, borders included, mm and 1."""
+    x, y = (np.linspace(-half, half, SHAPE) for half in screen.half_size)
+    return _surface(*shape_of(screen).at(x[:, None], y[None, :]))
 
 
 def _assembled(words: dict[str, str], data: dict) -> str:
@@ -187,17 +199,33 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def _cloud(scene: Scene, field: HeightField, heights: Tensor, cells: int) -> dict:
-    """The exit surface on a regular grid over the aperture, and the profile of a plane wave there."""
-    longest = max(scene.lens.size)
-    counts = tuple(COARSEST * max(1, round(cells * w / longest / COARSEST)) + 1 for w in scene.lens.size)
-    grid = sample_grid(field, heights, counts)
-    profile = scene.source.profile
+    """The exit surface, the entrance surface if it is free-form, and the profile of a plane wave, on a regular grid over the
+    aperture."""
+    lens, profile = scene.lens, scene.source.profile
+    counts = tuple(COARSEST * max(1, round(cells * w / max(lens.size) / COARSEST)) + 1 for w in lens.size)
+    exit = sample_grid(field, heights, counts)
+    entrance = None if lens.entrance is None else entrance_grid(lens, counts)
     return {
-        "z": _coded(grid.z),
-        "zx": _coded(grid.zx),
-        "zy": _coded(grid.zy),
+        "exit": _surface(exit.z, exit.zx, exit.zy),
+        "entrance": None if entrance is None else _surface(lens.z_in + entrance.z, entrance.zx, entrance.zy),
         "profile": None if profile is None else _coded(_at_points(profile, counts)),
     }
+
+
+def entrance_grid(lens: Lens, counts: tuple[int, int]) -> SurfaceGrid:
+    """A free-form entrance on a regular grid of points (n, m) over the aperture, its heights measured from z_in, mm."""
+    front = entrance_of(lens)
+    return sample_grid(front.field, front.heights, counts)
+
+
+def _surface(z: np.ndarray, zx: np.ndarray, zy: np.ndarray) -> dict:
+    """Heights and slopes (n, m) of a surface."""
+    return {"z": _coded(z), "zx": _coded(zx), "zy": _coded(zy)}
+
+
+def _length(held: dict) -> int:
+    """Bytes of all grids in nested parts of the page's data."""
+    return len(held["data"]) if "data" in held else sum(_length(part) for part in held.values() if part)
 
 
 def _at_points(profile: np.ndarray, counts: tuple[int, int]) -> np.ndarray:

@@ -2,16 +2,19 @@
 // Traces the lens that the page holds, shows it, and answers the controls.  Lengths are mm, angles degrees where a person reads them.
 //
 // The image is the sum of beams: light of one point of the source at one refractive index.  A beam is cut by the grid of the exit's
-// points into cells.  The rays through a cell's four corners are traced exactly (Snell's law at the flat entrance and at the exit,
+// points into cells.  The rays through a cell's four corners are traced exactly (Snell's law at the entrance and at the exit,
 // Fresnel's losses, absorption); the power that enters through the cell is spread evenly over a rectangle on the screen about the mean
 // of the four landing points, as wide as a parallelogram of the same edges has standard deviations, and shared out among the pixels
 // that it covers.  No light is lost by that, and where cells are smaller than pixels the image is that of endless rays.
 //
-//   x, y, z, zx, zy   a point of the exit, its height and slopes         t   thickness of the glass below it
-//   ax, ay, az        direction of the ray in air before the lens        n   refractive index, 1 before a mirror
-//   dx, dy, dz        direction before the exit, a / n along the entrance
-//   ex, ey            where it passes the entrance; w, power per area there that arrives on the screen
+//   x, y, z, zx, zy   a point of the exit, its height and slopes         n   refractive index, 1 before a mirror
+//   ax, ay, az        direction of the ray in air before the lens        dx, dy, dz   in the glass, before the exit
+//   ex, ey            where it enters: on a surface of heights s and slopes sx, sy, flat or free-form; glass, its way from there, mm
+//   qx, qy            where it passes the plane of the pupil, which the source illuminates; w, power per area there that arrives
 //   px, py            landing point, in pixels from the screen's low edges
+//
+// The entrance point is that of the path whose optical length is stationary (Fermat's principle), by Newton's method from the path
+// that a flat entrance would refract paraxially.  A curved screen is met likewise, from the point of its tangent plane.
 //
 // The graphics processor does the same in a vertex shader, one point a cell; its text below follows the functions here.
 
@@ -22,6 +25,7 @@ const SLICE = 14; // ms of work between two answers to the person
 const BLUR = 3; // beams for each square pixel of the blur, and at most, of one place of an extended source
 const MOST_BEAMS = 300;
 const DEEPEST = 100; // times that the relief is shown as deep
+const STEPS = 12, FINE = 1e-7; // of Newton's method, at most, and the length of the last, mm, whose error is its square
 const GOLDEN = Math.PI * (3 - Math.sqrt(5));
 const byId = (id) => document.getElementById(id);
 const square = (a) => a * a;
@@ -46,12 +50,20 @@ async function decoded({ shape: [n, m], low, step, data }) {
   return values;
 }
 
+/** A grid of the heights and slopes of a surface over +-reach, mm; null for none. */
+async function gridOf(part, reach) {
+  if (!part) return null;
+  const [z, zx, zy] = await Promise.all([part.z, part.zx, part.zy].map(decoded)), [nx, ny] = part.z.shape;
+  return { nx, ny, z, zx, zy, reach };
+}
+
 async function unpacked() {
-  const [nx, ny] = held.cloud.z.shape, parts = {};
-  for (const [name, part] of Object.entries(held.cloud)) parts[name] = part && (await decoded(part));
+  const { exit, entrance, profile } = held.cloud, reach = held.lens.size.map((s) => s / 2);
+  const cloud = { ...(await gridOf(exit, reach)), profile: profile && (await decoded(profile)), entrance: await gridOf(entrance, reach) };
+  cloud.shape = await gridOf(held.screen.shape, held.screen.low.map(Math.abs));
   const target = held.target && (await decoded(held.target)), waves = held.waves && (await decoded(held.waves));
   const wavesColour = held.wavesColour && (await Promise.all(held.wavesColour.map(decoded)));
-  return { cloud: { nx, ny, ...parts }, target, waves, wavesColour };
+  return { cloud, target, waves, wavesColour };
 }
 
 // ---- the light: beams for a setting of the controls
@@ -130,8 +142,8 @@ const thinning = (beams) => (beams <= 4 ? 1 : beams <= 48 ? 2 : 4);
 
 // ---- tracing on the processor
 
-/** Rows of corners: landing points, places on the entrance, power per area; px is NaN where no light leaves. */
-const cornerRow = (length) => ["px", "py", "ex", "ey", "w"].reduce((row, name) => ({ ...row, [name]: new Float64Array(length) }), {});
+/** Rows of corners: landing points, places on the entrance and in the pupil, power per area; px is NaN where no light leaves. */
+const cornerRow = (length) => ["px", "py", "ex", "ey", "qx", "qy", "w"].reduce((row, name) => ({ ...row, [name]: new Float64Array(length) }), {});
 
 /** Part of unpolarised light reflected, of cosines c before and s behind a surface, eta = n before over n behind. */
 function reflectance(kind, c, s, eta) {
@@ -154,67 +166,142 @@ function intensity(beam, ax, ay, az) {
 /** x and y of the screen's centre where that is at z: it moves along the light. */
 const centreAt = (z) => held.screen.centre.map((c, k) => c + (z - held.screen.z) * held.screen.along[k]);
 
-/** Trace the corners of row i of the grid, every `thin`-th point, into `row`. */
-function traceRow(cloud, beam, z, i, thin, row) {
-  const { lens, screen } = held, { ny } = cloud, { n, near, x0, y0, h } = beam, [rx, ry] = lens.size.map((s) => s / 2);
-  const [[ux, uy, uz], [vx, vy, vz], [nx, nyy, nz]] = screen.axes, [mx, my] = centreAt(z);
-  const x = (2 * i / (cloud.nx - 1) - 1) * rx, { fresnel } = lens;
-  const flat = beam.near ? 1 : reflectance(fresnel, Math.sqrt(1 - square(beam.ax) - square(beam.ay)),
-    Math.sqrt(1 - square(beam.ax / n) - square(beam.ay / n)), 1 / n);
-  for (let j = 0, b = 0; j < ny; j += thin, b++) {
-    const k = i * ny + j, y = (2 * j / (ny - 1) - 1) * ry, zx = cloud.zx[k], zy = cloud.zy[k], height = cloud.z[k], t = height - lens.zIn;
-    let dx, dy, dz, ex, ey, w, lost = flat;
-    if (near) {
-      const qx = x - x0, qy = y - y0, r = Math.sqrt(qx * qx + qy * qy) || 1e-30;
-      let rho = (r * h) / (h + t / n), l = 0, sine = 0, c = 1; // rho: from below the source to the entrance point, by Newton's method
-      for (let step = 0; step < 4; step++) {
-        l = Math.sqrt(rho * rho + h * h); sine = rho / l; c = Math.sqrt(n * n - sine * sine);
-        rho -= (rho + (t * sine) / c - r) / (1 + (t * n * n * h * h) / (c * c * c * l * l * l));
-      }
-      l = Math.sqrt(rho * rho + h * h); sine = rho / l; c = Math.sqrt(n * n - sine * sine);
-      const ax = (sine * qx) / r, ay = (sine * qy) / r, az = h / l;
-      dx = ax / n; dy = ay / n; dz = c / n;
-      ex = x - (t * sine * qx) / (c * r); ey = y - (t * sine * qy) / (c * r); // from the exit: differences of near numbers
-      w = (intensity(beam, ax, ay, az) * az * az * az) / (h * h);
-      lost = fresnel ? reflectance(fresnel, az, dz, 1 / n) : 0;
-    } else {
-      dx = beam.ax / n; dy = beam.ay / n; dz = Math.sqrt(1 - dx * dx - dy * dy);
-      ex = x - (t * dx) / dz; ey = y - (t * dy) / dz;
-      w = 1;
-    }
-    w *= beam.power;
-    if (cloud.profile) w *= cloud.profile[k];
-    // the exit: N = (-zx, -zy, 1), c = d . N, s = t . N
-    const norm2 = 1 + zx * zx + zy * zy, c = dz - dx * zx - dy * zy;
-    let ox, oy, oz;
-    if (lens.mirror) {
-      const twice = (2 * c) / norm2;
-      ox = dx + twice * zx; oy = dy + twice * zy; oz = dz - twice;
-    } else {
-      const radicand = norm2 + n * n * (c * c - norm2);
-      if (!(radicand > 0)) { row.px[b] = NaN; continue; } // total internal reflection
-      const s = Math.sqrt(radicand), gamma = ((1 - n) * (1 + n)) / (s + n * c);
-      ox = n * dx - gamma * zx; oy = n * dy - gamma * zy; oz = n * dz + gamma;
-      if (fresnel) {
-        const length = fresnel === FRESNEL.schlick ? Math.sqrt(norm2) : 1;
-        w *= (1 - lost) * (1 - reflectance(fresnel, c / length, s / length, n));
-      }
-      if (lens.absorption) w *= Math.exp((-lens.absorption * t) / dz);
-    }
-    const way = ((z - height) * nz - (x - mx) * nx - (y - my) * nyy) / (ox * nx + oy * nyy + oz * nz);
-    const qx = x - mx + way * ox, qy = y - my + way * oy, qz = height + way * oz - z;
-    row.px[b] = way > 0 ? (qx * ux + qy * uy + qz * uz - screen.low[0]) / screen.pixel[0] : NaN;
-    row.py[b] = (qx * vx + qy * vy + qz * vz - screen.low[1]) / screen.pixel[1];
-    row.ex[b] = ex; row.ey[b] = ey; row.w[b] = w;
-  }
+/** Coordinates of the centre of a far screen along its axes. */
+const farCentre = () => held.screen.axes.slice(0, 2).map((a) => a[0] * held.screen.centre[0] + a[1] * held.screen.centre[1] + a[2] * held.screen.z);
+
+/** A surface as a function of x, y that tells `at` its height s, slopes sx, sy and their derivatives: a plane z = s, or a grid,
+ * linear between its points and beyond its border. */
+const flatAt = (s) => (x, y, at) => { at.s = s; at.sx = at.sy = at.sxx = at.sxy = at.syy = 0; };
+function gridAt({ nx, ny, z, zx, zy, reach: [rx, ry] }) {
+  const hx = (2 * rx) / (nx - 1), hy = (2 * ry) / (ny - 1);
+  return (x, y, at) => {
+    const u = (x + rx) / hx, v = (y + ry) / hy;
+    const i = Math.min(nx - 2, Math.max(0, Math.floor(u))), j = Math.min(ny - 2, Math.max(0, Math.floor(v))), k = i * ny + j;
+    const f = u - i, g = v - j, a = (1 - f) * (1 - g), b = f * (1 - g), c = (1 - f) * g, d = f * g, l = k + ny;
+    at.s = a * z[k] + b * z[l] + c * z[k + 1] + d * z[l + 1];
+    at.sx = a * zx[k] + b * zx[l] + c * zx[k + 1] + d * zx[l + 1];
+    at.sy = a * zy[k] + b * zy[l] + c * zy[k + 1] + d * zy[l + 1];
+    at.sxx = ((1 - g) * (zx[l] - zx[k]) + g * (zx[l + 1] - zx[k + 1])) / hx;
+    at.syy = ((1 - f) * (zy[k + 1] - zy[k]) + f * (zy[l + 1] - zy[l])) / hy;
+    at.sxy = 0.5 * (((1 - f) * (zx[k + 1] - zx[k]) + f * (zx[l + 1] - zx[l])) / hy + ((1 - g) * (zy[l] - zy[k]) + g * (zy[l + 1] - zy[k + 1])) / hx);
+  };
 }
 
-/** Part of a cell with its middle at x, y on the exit and sides along x and y from e to f on the entrance that both apertures pass. */
-function passed(x, y, e0, f0, e1, f1) {
+/** The entrance of a lens as a function that finds how the light of a beam reaches a point of the exit: a, d, e, q and glass of `ray`,
+ * the power w per area of the pupil, and `lost`, the part that the entrance reflects. */
+function entranceOf(cloud) {
+  const { lens } = held, surface = cloud.entrance ? gridAt(cloud.entrance) : flatAt(lens.zIn);
+  return (beam, x, y, z, ray) => {
+    const { n, near, x0, y0, h } = beam, z0 = lens.zIn - h, t = z - lens.zIn;
+    let ax = beam.ax, ay = beam.ay, az = near ? 1 : Math.sqrt(1 - ax * ax - ay * ay), away = 0; // 1 / distance from the source
+    let ex = near ? (x * h + x0 * (t / n)) / (h + t / n) : x - (t * ax) / Math.sqrt(n * n - ax * ax - ay * ay);
+    let ey = near ? (y * h + y0 * (t / n)) / (h + t / n) : y - (t * ay) / Math.sqrt(n * n - ax * ax - ay * ay);
+    for (let step = 0; ; step++) {
+      surface(ex, ey, ray);
+      if (near) {
+        ax = ex - x0; ay = ey - y0; az = ray.s - z0;
+        away = 1 / Math.sqrt(ax * ax + ay * ay + az * az);
+        ax *= away; ay *= away; az *= away;
+      }
+      if (n === 1 || step === STEPS) break; // the straight path is exact without refraction
+      let dx = x - ex, dy = y - ey, dz = z - ray.s;
+      const r = 1 / Math.sqrt(dx * dx + dy * dy + dz * dz), { sx, sy } = ray;
+      dx *= r; dy *= r; dz *= r;
+      const gz = az - n * dz, gx = ax - n * dx + gz * sx, gy = ay - n * dy + gz * sy; // the optical path's gradient by e, its Hessian
+      const au = ax + az * sx, av = ay + az * sy, du = dx + dz * sx, dv = dy + dz * sy;
+      const hxx = away * (1 + sx * sx - au * au) + n * r * (1 + sx * sx - du * du) + gz * ray.sxx;
+      const hyy = away * (1 + sy * sy - av * av) + n * r * (1 + sy * sy - dv * dv) + gz * ray.syy;
+      const hxy = away * (sx * sy - au * av) + n * r * (sx * sy - du * dv) + gz * ray.sxy;
+      const det = hxx * hyy - hxy * hxy, mx = (hyy * gx - hxy * gy) / det, my = (hxx * gy - hxy * gx) / det;
+      ex -= mx; ey -= my;
+      if (mx * mx + my * my < FINE * FINE) step = STEPS - 1;
+    }
+    const { s, sx, sy } = ray, norm2 = 1 + sx * sx + sy * sy, c = az - ax * sx - ay * sy, root = Math.sqrt(c * c + (n * n - 1) * norm2);
+    const gamma = (n * n - 1) / (root + c); // n d = a + gamma N, N = (-sx, -sy, 1)
+    ray.dx = (ax - gamma * sx) / n; ray.dy = (ay - gamma * sy) / n; ray.dz = (az + gamma) / n;
+    ray.ex = ex; ray.ey = ey; ray.glass = (z - s) / ray.dz;
+    ray.qx = ex + ((lens.zIn - s) * ax) / az; ray.qy = ey + ((lens.zIn - s) * ay) / az;
+    ray.w = near ? (intensity(beam, ax, ay, az) * az * az * az) / (h * h) : 1;
+    ray.lost = lens.fresnel && n > 1 ? reflectance(lens.fresnel, c / Math.sqrt(norm2), root / (n * Math.sqrt(norm2)), 1 / n) : 0;
+  };
+}
+
+/** The screen at z as a function that finds the landing point of light from a point along a unit direction, in pixels, px is NaN where
+ * it does not arrive: on a plane, on a surface whose heights over that are a grid, or by direction alone. */
+function screenAt(cloud, z) {
+  const { axes: [[ux, uy, uz], [vx, vy, vz], [nx, ny, nz]], low, pixel, focal, facing } = held.screen;
+  const [mx, my] = centreAt(z), shape = cloud.shape && gridAt(cloud.shape), at = {};
+  const land = (px, py, arrives, row, b) => { row.px[b] = arrives ? (px - low[0]) / pixel[0] : NaN; row.py[b] = (py - low[1]) / pixel[1]; };
+  if (focal) {
+    const [cx, cy] = farCentre();
+    return (x, y, height, ox, oy, oz, row, b) => land(focal * (ox * ux + oy * uy + oz * uz) - cx, focal * (ox * vx + oy * vy + oz * vz) - cy,
+      (ox * nx + oy * ny + oz * nz > 0) === facing, row, b);
+  }
+  return (x, y, height, ox, oy, oz, row, b) => {
+    const along = ox * nx + oy * ny + oz * nz, way = ((z - height) * nz - (x - mx) * nx - (y - my) * ny) / along;
+    const qx = x - mx + way * ox, qy = y - my + way * oy, qz = height + way * oz - z;
+    const px = qx * ux + qy * uy + qz * uz, py = qx * vx + qy * vy + qz * vz;
+    if (!shape) { land(px, py, way > 0, row, b); return; }
+    const kx = (ox * ux + oy * uy + oz * uz) / along, ky = (ox * vx + oy * vy + oz * vz) / along;
+    let high = 0, steep = 1; // above the tangent plane; how fast the ray nears the surface
+    for (let step = 0; step < STEPS; step++) {
+      shape(px + high * kx, py + high * ky, at);
+      steep = 1 - at.sx * kx - at.sy * ky;
+      const move = (high - at.s) / steep;
+      high -= move;
+      if (Math.abs(move) < FINE) break;
+    }
+    land(px + high * kx, py + high * ky, way + high / along > 0 && steep > 0, row, b);
+  };
+}
+
+/** The index of a grid's point, of n along an axis, that is nearest to u on [-1, 1]. */
+const nearest = (u, n) => Math.min(n - 1, Math.max(0, Math.round(0.5 * (u + 1) * (n - 1))));
+
+/** A function that traces the corners of row i of the grid, every `thin`-th point, into `row`; the screen is at z. */
+function rowTracer(cloud, z, thin) {
+  const { lens } = held, { fresnel } = lens, { ny } = cloud, [rx, ry] = lens.size.map((s) => s / 2);
+  const enter = entranceOf(cloud), meet = screenAt(cloud, z), ray = {};
+  return (beam, i, row) => {
+    const x = (2 * i / (cloud.nx - 1) - 1) * rx, { n } = beam;
+    for (let j = 0, b = 0; j < ny; j += thin, b++) {
+      const k = i * ny + j, y = (2 * j / (ny - 1) - 1) * ry, zx = cloud.zx[k], zy = cloud.zy[k], height = cloud.z[k];
+      enter(beam, x, y, height, ray);
+      const { dx, dy, dz } = ray;
+      let w = ray.w * beam.power;
+      if (cloud.profile) w *= cloud.profile[nearest(ray.qx / rx, cloud.nx) * ny + nearest(ray.qy / ry, ny)];
+      // the exit: N = (-zx, -zy, 1), c = d . N, s = t . N
+      const norm2 = 1 + zx * zx + zy * zy, c = dz - dx * zx - dy * zy;
+      let ox, oy, oz;
+      if (lens.mirror) {
+        const twice = (2 * c) / norm2;
+        ox = dx + twice * zx; oy = dy + twice * zy; oz = dz - twice;
+      } else {
+        const radicand = norm2 + n * n * (c * c - norm2);
+        if (!(radicand > 0)) { row.px[b] = NaN; continue; } // total internal reflection
+        const s = Math.sqrt(radicand), gamma = ((1 - n) * (1 + n)) / (s + n * c);
+        ox = n * dx - gamma * zx; oy = n * dy - gamma * zy; oz = n * dz + gamma;
+        if (fresnel) {
+          const length = fresnel === FRESNEL.schlick ? Math.sqrt(norm2) : 1;
+          w *= (1 - ray.lost) * (1 - reflectance(fresnel, c / length, s / length, n));
+        }
+        if (lens.absorption) w *= Math.exp(-lens.absorption * ray.glass);
+      }
+      meet(x, y, height, ox, oy, oz, row, b);
+      row.ex[b] = ray.ex; row.ey[b] = ray.ey; row.qx[b] = ray.qx; row.qy[b] = ray.qy; row.w[b] = w;
+    }
+  };
+}
+
+/** Part of a cell of rows p and q, corners b and c = b + 1, with its middle at x, y on the exit, that exit, entrance and pupil pass. */
+function passed(p, q, b, c, x, y) {
   const [rx, ry] = held.lens.size.map((s) => s / 2);
-  if (!held.lens.round) return within(e0, f0, rx) * within(e1, f1, ry);
-  const side = Math.sqrt(Math.abs((f0 - e0) * (f1 - e1))), edge = (r) => Math.min(1, Math.max(0, 0.5 + (rx - r) / side));
-  return Math.min(edge(Math.sqrt(x * x + y * y)), edge(0.5 * Math.sqrt(square(e0 + f0) + square(e1 + f1))));
+  const part = (ex, ey) => {
+    const e0 = 0.5 * (p[ex][b] + p[ex][c]), f0 = 0.5 * (q[ex][b] + q[ex][c]), e1 = 0.5 * (p[ey][b] + q[ey][b]), f1 = 0.5 * (p[ey][c] + q[ey][c]);
+    if (!held.lens.round) return within(e0, f0, rx) * within(e1, f1, ry);
+    return Math.min(1, Math.max(0, 0.5 + (rx - Math.max(Math.hypot(x, y), 0.5 * Math.hypot(e0 + f0, e1 + f1))) / Math.sqrt(Math.abs((f0 - e0) * (f1 - e1)))));
+  };
+  return Math.min(part("ex", "ey"), part("qx", "qy"));
 }
 
 /** Part of the way from e to f that lies within +-r. */
@@ -227,10 +314,9 @@ function splatRow(p, q, x, dy, count, image) {
     const c = b + 1;
     const cx = 0.25 * (p.px[b] + p.px[c] + q.px[b] + q.px[c]), cy = 0.25 * (p.py[b] + p.py[c] + q.py[b] + q.py[c]);
     if (!(cx > -1e6 && cx < 1e6 && cy > -1e6 && cy < 1e6)) continue; // also NaN
-    const w = 0.25 * (p.w[b] + p.w[c] + q.w[b] + q.w[c]) * passed(x, (b + 0.5) * dy - ry, 0.5 * (p.ex[b] + p.ex[c]),
-      0.5 * (q.ex[b] + q.ex[c]), 0.5 * (p.ey[b] + q.ey[b]), 0.5 * (p.ey[c] + q.ey[c]));
+    const w = 0.25 * (p.w[b] + p.w[c] + q.w[b] + q.w[c]) * passed(p, q, b, c, x, (b + 0.5) * dy - ry);
     if (!(w > 0)) continue;
-    const area = 0.5 * Math.abs((q.ex[c] - p.ex[b]) * (q.ey[b] - p.ey[c]) - (q.ex[b] - p.ex[c]) * (q.ey[c] - p.ey[b]));
+    const area = 0.5 * Math.abs((q.qx[c] - p.qx[b]) * (q.qy[b] - p.qy[c]) - (q.qx[b] - p.qx[c]) * (q.qy[c] - p.qy[b]));
     const wide = Math.max(SMALLEST, 0.5 * Math.sqrt(square(q.px[b] + q.px[c] - p.px[b] - p.px[c]) + square(p.px[c] + q.px[c] - p.px[b] - q.px[b])));
     const tall = Math.max(SMALLEST, 0.5 * Math.sqrt(square(q.py[b] + q.py[c] - p.py[b] - p.py[c]) + square(p.py[c] + q.py[c] - p.py[b] - q.py[b])));
     const x0 = cx - 0.5 * wide, x1 = cx + 0.5 * wide, y0 = cy - 0.5 * tall, y1 = cy + 0.5 * tall;
@@ -246,10 +332,11 @@ function splatRow(p, q, x, dy, count, image) {
 function* tracedHere(cloud, beams, z, thin) {
   const [mx, my] = held.screen.resolution, image = new Float64Array(mx * my), count = (cloud.ny - 1) / thin + 1;
   const [dx, dy] = [held.lens.size[0] / (cloud.nx - 1), held.lens.size[1] / (cloud.ny - 1)].map((d) => d * thin);
+  const traceRow = rowTracer(cloud, z, thin);
   let before = cornerRow(count), now = cornerRow(count);
   for (const beam of beams) {
     for (let i = 0; i < cloud.nx; i += thin) {
-      traceRow(cloud, beam, z, i, thin, now);
+      traceRow(beam, i, now);
       if (i > 0) splatRow(before, now, (i / thin - 0.5) * dx - held.lens.size[0] / 2, dy, count, image);
       [before, now] = [now, before];
       yield;
@@ -262,10 +349,10 @@ function* tracedHere(cloud, beams, z, thin) {
 
 const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D;
-uniform sampler2D cloud, table; uniform ivec2 points; uniform int thin;
-uniform bool near, isRound, isMirror, cut; uniform int fresnel;
-uniform vec3 origin, axis, u, v, normal; uniform vec2 direction, radius, middle, low, pixel; uniform vec4 frame;
-uniform float n, power, zIn, absorption, chord, z, largest, smallest;
+uniform sampler2D cloud, table, entrance, shape; uniform ivec2 points; uniform int thin;
+uniform bool near, isRound, isMirror, cut, bent, curved; uniform int fresnel;
+uniform vec3 origin, axis, u, v, normal; uniform vec2 direction, radius, middle, low, pixel, reach, offset; uniform vec4 frame;
+uniform float n, power, zIn, absorption, chord, z, largest, smallest, focal, forward;
 flat out vec4 box; flat out float each;
 float reflectance(float c, float s, float eta) {
   if (fresnel == 2) { float a = (eta * c - s) / (eta * c + s), b = (c - eta * s) / (c + eta * s); return 0.5 * (a * a + b * b); }
@@ -278,27 +365,54 @@ float intensity(vec3 a) {
   float at = min(s * float(last), float(last) - 1e-3); int k = int(at);
   return mix(texelFetch(table, ivec2(k, 0), 0).r, texelFetch(table, ivec2(k + 1, 0), 0).r, at - float(k));
 }
-bool corner(ivec2 at, out vec2 landing, out vec2 entrance, out float w) {
+vec3 onGrid(sampler2D grid, vec2 reach, vec2 at, out vec3 bend) {
+  vec2 last = vec2(textureSize(grid, 0).yx - 1), size = 2.0 * reach / last, place = (at + reach) / size;
+  vec2 cell = clamp(floor(place), vec2(0.0), last - 1.0), f = place - cell; ivec2 k = ivec2(cell);
+  vec3 a = texelFetch(grid, k.yx, 0).xyz, b = texelFetch(grid, k.yx + ivec2(0, 1), 0).xyz;
+  vec3 c = texelFetch(grid, k.yx + ivec2(1, 0), 0).xyz, d = texelFetch(grid, k.yx + 1, 0).xyz;
+  vec3 along = mix(b - a, d - c, f.y) / size.x, upward = mix(c - a, d - b, f.x) / size.y;
+  bend = vec3(along.y, 0.5 * (along.z + upward.y), upward.z);
+  return mix(mix(a, b, f.x), mix(c, d, f.x), f.y);
+}
+void enter(vec3 to, out vec3 d, out vec2 e, out vec2 q, out float w, out float lost, out float glass) {
+  float h = origin.z, t = to.z - zIn, away = 0.0; vec3 a = vec3(direction, near ? 1.0 : sqrt(1.0 - dot(direction, direction)));
+  e = near ? (to.xy * h + origin.xy * (t / n)) / (h + t / n) : to.xy - t * direction / sqrt(n * n - dot(direction, direction));
+  vec3 p = vec3(zIn, 0.0, 0.0), bend = vec3(0.0);
+  for (int step = 0; ; step++) {
+    if (bent) p = onGrid(entrance, radius, e, bend);
+    if (near) { vec2 side = e - origin.xy; float up = p.x - zIn + h; away = inversesqrt(dot(side, side) + up * up); a = vec3(side, up) * away; }
+    if (n == 1.0 || step == 6) break;
+    vec3 way = to - vec3(e, p.x); float r = inversesqrt(dot(way, way)); way *= r;
+    float gz = a.z - n * way.z; vec2 g = a.xy - n * way.xy + gz * p.yz, s = a.xy + a.z * p.yz, o = way.xy + way.z * p.yz;
+    vec3 hessian = away * vec3(1.0 + p.y * p.y - s.x * s.x, p.y * p.z - s.x * s.y, 1.0 + p.z * p.z - s.y * s.y)
+      + n * r * vec3(1.0 + p.y * p.y - o.x * o.x, p.y * p.z - o.x * o.y, 1.0 + p.z * p.z - o.y * o.y) + gz * bend;
+    e -= vec2(hessian.z * g.x - hessian.y * g.y, hessian.x * g.y - hessian.y * g.x) / (hessian.x * hessian.z - hessian.y * hessian.y);
+  }
+  float norm2 = 1.0 + dot(p.yz, p.yz), c = a.z - dot(a.xy, p.yz), denser = (n - 1.0) * (n + 1.0), root = sqrt(c * c + denser * norm2);
+  d = (a + denser / (root + c) * vec3(-p.yz, 1.0)) / n;
+  glass = (to.z - p.x) / d.z;
+  if (!bent) e = to.xy - glass * d.xy; // from the exit: differences of near numbers
+  q = e + (zIn - p.x) / a.z * a.xy;
+  w = near ? intensity(a) * a.z * (a.z / h) * (a.z / h) : 1.0;
+  lost = fresnel > 0 && n > 1.0 ? reflectance(c / sqrt(norm2), root / (n * sqrt(norm2)), 1.0 / n) : 0.0;
+}
+bool meet(vec3 from, vec3 o, out vec2 landing) {
+  float along = dot(o, normal); vec2 at = vec2(dot(o, u), dot(o, v));
+  if (focal > 0.0) { landing = (focal * at - offset - low) / pixel; return along * forward > 0.0; }
+  float way = -dot(from, normal) / along, high = 0.0, steep = 1.0; vec3 q = from + way * o; vec2 base = vec2(dot(q, u), dot(q, v));
+  if (curved) for (int step = 0; step < 8; step++) {
+    vec3 bend, p = onGrid(shape, reach, base + high * at / along, bend);
+    steep = 1.0 - dot(p.yz, at) / along; high -= (high - p.x) / steep;
+  }
+  landing = (base + high * at / along - low) / pixel;
+  return way + high / along > 0.0 && steep > 0.0;
+}
+bool corner(ivec2 at, out vec2 landing, out vec2 e, out vec2 q, out float w) {
   vec4 p = texelFetch(cloud, at.yx, 0);
   vec2 xy = (2.0 * vec2(at) / vec2(points - 1) - 1.0) * radius;
-  float t = p.x - zIn, lost = 0.0; vec3 d;
-  if (near) {
-    float h = origin.z; vec2 q = xy - origin.xy; float r = max(length(q), 1e-30), rho = r * h / (h + t / n), l, sine, c;
-    for (int step = 0; step < 4; step++) {
-      l = sqrt(rho * rho + h * h); sine = rho / l; c = sqrt(n * n - sine * sine);
-      float steep = h / l;
-      rho -= (rho + t * sine / c - r) / (1.0 + t * n * n * steep * steep / (c * c * c * l));
-    }
-    l = sqrt(rho * rho + h * h); sine = rho / l; c = sqrt(n * n - sine * sine);
-    vec3 a = vec3(sine * q / r, h / l);
-    d = vec3(a.xy / n, c / n); entrance = xy - t * sine / c * q / r;
-    w = intensity(a) * a.z * (a.z / h) * (a.z / h);
-    if (fresnel > 0) lost = reflectance(a.z, d.z, 1.0 / n);
-  } else {
-    d.xy = direction / n; d.z = sqrt(1.0 - dot(d.xy, d.xy)); entrance = xy - t * d.xy / d.z; w = 1.0;
-    if (fresnel > 0) lost = reflectance(sqrt(1.0 - dot(direction, direction)), d.z, 1.0 / n);
-  }
-  w *= power * p.w;
+  vec3 d; float lost, glass;
+  enter(vec3(xy, p.x), d, e, q, w, lost, glass);
+  w *= power * texelFetch(cloud, clamp(ivec2(0.5 * (q / radius + 1.0) * vec2(points - 1) + 0.5), ivec2(0), points - 1).yx, 0).w;
   float norm2 = 1.0 + dot(p.yz, p.yz), c = d.z - dot(d.xy, p.yz); vec3 o;
   if (isMirror) { float twice = 2.0 * c / norm2; o = vec3(d.xy + twice * p.yz, d.z - twice); }
   else {
@@ -307,12 +421,9 @@ bool corner(ivec2 at, out vec2 landing, out vec2 entrance, out float w) {
     float s = sqrt(radicand), gamma = (1.0 - n) * (1.0 + n) / (s + n * c);
     o = vec3(n * d.xy - gamma * p.yz, n * d.z + gamma);
     if (fresnel > 0) { float l = fresnel == 1 ? sqrt(norm2) : 1.0; w *= (1.0 - lost) * (1.0 - reflectance(c / l, s / l, n)); }
-    if (absorption > 0.0) w *= exp(-absorption * t / d.z);
+    if (absorption > 0.0) w *= exp(-absorption * glass);
   }
-  vec3 from = vec3(xy - middle, p.x - z);
-  float way = -dot(from, normal) / dot(o, normal); vec3 q = from + way * o;
-  landing = (vec2(dot(q, u), dot(q, v)) - low) / pixel;
-  return way > 0.0;
+  return meet(vec3(xy - middle, p.x - z), o, landing);
 }
 float passed(vec2 exit, vec2 e, vec2 f) {
   vec2 part = clamp((min(max(e, f), radius) - max(min(e, f), -radius)) / abs(f - e), 0.0, 1.0);
@@ -322,14 +433,15 @@ float passed(vec2 exit, vec2 e, vec2 f) {
 }
 void main() {
   int along = (points.y - 1) / thin; ivec2 at = ivec2(gl_VertexID / along, gl_VertexID % along) * thin;
-  vec2 a, b, c, d, ea, eb, ec, ed; float wa, wb, wc, wd;
-  bool lit = corner(at, a, ea, wa); lit = corner(at + ivec2(0, thin), b, eb, wb) && lit;
-  lit = corner(at + ivec2(thin, 0), c, ec, wc) && lit; lit = corner(at + thin, d, ed, wd) && lit;
+  vec2 a, b, c, d, ea, eb, ec, ed, qa, qb, qc, qd; float wa, wb, wc, wd;
+  bool lit = corner(at, a, ea, qa, wa); lit = corner(at + ivec2(0, thin), b, eb, qb, wb) && lit;
+  lit = corner(at + ivec2(thin, 0), c, ec, qc, wc) && lit; lit = corner(at + thin, d, ed, qd, wd) && lit;
   vec2 centre = 0.25 * (a + b + c + d), across = c + d - a - b, upward = b + d - a - c;
   vec2 sides = clamp(0.5 * sqrt(across * across + upward * upward), vec2(smallest), vec2(largest));
-  vec2 g = ed - ea, f = ec - eb; float area = 0.5 * abs(g.x * f.y - f.x * g.y);
+  vec2 g = qd - qa, f = qc - qb; float area = 0.5 * abs(g.x * f.y - f.x * g.y);
   vec2 exit = ((2.0 * vec2(at) + float(thin)) / vec2(points - 1) - 1.0) * radius;
-  float share = passed(exit, 0.5 * vec2(ea.x + eb.x, ea.y + ec.y), 0.5 * vec2(ec.x + ed.x, eb.y + ed.y));
+  float share = passed(exit, 0.5 * vec2(qa.x + qb.x, qa.y + qc.y), 0.5 * vec2(qc.x + qd.x, qb.y + qd.y));
+  if (bent) share = min(share, passed(exit, 0.5 * vec2(ea.x + eb.x, ea.y + ec.y), 0.5 * vec2(ec.x + ed.x, eb.y + ed.y)));
   each = 0.25 * (wa + wb + wc + wd) * share * area / (sides.x * sides.y);
   box = vec4(centre - 0.5 * sides, centre + 0.5 * sides);
   lit = lit && each > 0.0 && all(lessThan(abs(centre), vec2(1e6)));
@@ -367,9 +479,14 @@ function graphicsTracer(cloud, slowToo) {
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
     return made;
   };
-  const texels = new Float32Array(4 * cloud.z.length);
-  for (let k = 0; k < cloud.z.length; k++) texels.set([cloud.z[k], cloud.zx[k], cloud.zy[k], cloud.profile ? cloud.profile[k] : 1], 4 * k);
-  texture(0, gl.RGBA32F, cloud.ny, cloud.nx, gl.RGBA, texels);
+  const surface = (unit, grid, fourth) => {
+    const texels = new Float32Array(4 * grid.z.length);
+    for (let k = 0; k < grid.z.length; k++) texels.set([grid.z[k], grid.zx[k], grid.zy[k], fourth ? fourth[k] : 1], 4 * k);
+    texture(unit, gl.RGBA32F, grid.ny, grid.nx, gl.RGBA, texels);
+  };
+  surface(0, cloud, cloud.profile);
+  if (cloud.entrance) surface(3, cloud.entrance);
+  if (cloud.shape) surface(4, cloud.shape);
   const tables = held.lights.map((light) => light.near && texture(1, gl.R32F, light.intensity.length, 1, gl.RED, new Float32Array(light.intensity)));
   const sum = texture(2, gl.RGBA32F, wide, tall, gl.RGBA, null);
   gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
@@ -377,13 +494,16 @@ function graphicsTracer(cloud, slowToo) {
   if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) return null;
   gl.activeTexture(gl.TEXTURE2);
   gl.bindTexture(gl.TEXTURE_2D, null);
-  const { lens, screen } = held, [rx, ry] = lens.size.map((s) => s / 2);
+  const { lens, screen } = held;
   gl.viewport(0, 0, wide, tall);
   gl.enable(gl.BLEND); gl.blendFunc(gl.ONE, gl.ONE); gl.disable(gl.DEPTH_TEST);
-  gl.uniform1i(at("cloud"), 0); gl.uniform1i(at("table"), 1);
+  gl.uniform1i(at("cloud"), 0); gl.uniform1i(at("table"), 1); gl.uniform1i(at("entrance"), 3); gl.uniform1i(at("shape"), 4);
+  gl.uniform1i(at("bent"), Boolean(cloud.entrance)); gl.uniform1i(at("curved"), Boolean(cloud.shape));
+  if (cloud.shape) gl.uniform2f(at("reach"), ...cloud.shape.reach);
+  gl.uniform1f(at("focal"), screen.focal); gl.uniform1f(at("forward"), screen.facing ? 1 : -1); gl.uniform2f(at("offset"), ...farCentre());
   gl.uniform2i(at("points"), cloud.nx, cloud.ny);
   gl.uniform1i(at("isRound"), lens.round); gl.uniform1i(at("isMirror"), lens.mirror); gl.uniform1i(at("fresnel"), lens.fresnel);
-  gl.uniform2f(at("radius"), rx, ry); gl.uniform2f(at("low"), ...screen.low); gl.uniform2f(at("pixel"), ...screen.pixel);
+  gl.uniform2f(at("radius"), ...cloud.reach); gl.uniform2f(at("low"), ...screen.low); gl.uniform2f(at("pixel"), ...screen.pixel);
   gl.uniform3f(at("u"), ...screen.axes[0]); gl.uniform3f(at("v"), ...screen.axes[1]); gl.uniform3f(at("normal"), ...screen.axes[2]);
   gl.uniform4f(at("frame"), wide, tall, MARGIN, 0);
   gl.uniform1f(at("zIn"), lens.zIn); gl.uniform1f(at("absorption"), lens.absorption);
@@ -442,6 +562,19 @@ function intoGamut(rgb) {
   return rgb.map((v) => clamped(grey + kept * (v - grey)));
 }
 
+/** Areas of the screen's pixels over those of a plane one; null for a plane one. */
+function areasOf(shape) {
+  if (!shape) return null;
+  const { resolution: [mx, my], low, pixel } = held.screen, surface = gridAt(shape), at = {}, areas = new Float64Array(mx * my);
+  for (let i = 0; i < mx; i++) {
+    for (let j = 0; j < my; j++) {
+      surface(low[0] + (i + 0.5) * pixel[0], low[1] + (j + 0.5) * pixel[1], at);
+      areas[i * my + j] = Math.sqrt(1 + at.sx * at.sx + at.sy * at.sy);
+    }
+  }
+  return areas;
+}
+
 /** Show irradiance as render.png does: white is the target's greatest at the image's power; in colour where `planes` of linear red,
  * green and blue are given. */
 function paintLight(canvas, image, white, planes = null) {
@@ -471,23 +604,26 @@ function solidView(canvas, cloud) {
   const view = { yaw: -0.5, pitch: lens.mirror ? Math.PI - 0.95 : -0.95, zoom: 1, relief: 1 };
   const xs = Float64Array.from({ length: nx }, (_, i) => (2 * i / (nx - 1) - 1) * rx);
   const ys = Float64Array.from({ length: ny }, (_, j) => (2 * j / (ny - 1) - 1) * ry);
-  // The least-squares fit of z by 1, x, y and x^2 + y^2 less its mean, which are orthogonal on this grid.
-  const q0 = sum(xs.map(square)) / nx + sum(ys.map(square)) / ny, dots = [0, 0, 0, 0], norms = [0, 0, 0, 0];
-  let high = -Infinity;
-  for (let i = 0, k = 0; i < nx; i++) {
-    for (let j = 0; j < ny; j++, k++) {
-      [1, xs[i], ys[j], square(xs[i]) + square(ys[j]) - q0].forEach((b, m) => { dots[m] += b * cloud.z[k]; norms[m] += b * b; });
-      high = Math.max(high, cloud.z[k]);
+  const q0 = sum(xs.map(square)) / nx + sum(ys.map(square)) / ny, size = Math.hypot(2 * rx, 2 * ry);
+  /** A side, about its least-squares fit by 1, x, y and x^2 + y^2 less its mean, which are orthogonal on this grid: its middle c0, its
+   * roughness, heights and slopes at a point with the departure from the fit `k` times as deep. */
+  const sideOf = (grid) => {
+    const dots = [0, 0, 0, 0], norms = [0, 0, 0, 0];
+    for (let i = 0, k = 0; i < nx; i++) {
+      for (let j = 0; j < ny; j++, k++) [1, xs[i], ys[j], square(xs[i]) + square(ys[j]) - q0].forEach((b, m) => { dots[m] += b * grid.z[k]; norms[m] += b * b; });
     }
-  }
-  const [c0, cx, cy, cq] = dots.map((d, m) => d / norms[m]);
-  const fit = (x, y) => c0 + cx * x + cy * y + cq * (x * x + y * y - q0);
-  let rough = 0;
-  for (let i = 0, k = 0; i < nx; i++) {
-    for (let j = 0; j < ny; j++, k++) rough += square(cloud.zx[k] - cx - 2 * cq * xs[i]) + square(cloud.zy[k] - cy - 2 * cq * ys[j]);
-  }
-  const usual = Math.min(DEEPEST, Math.max(1, 0.25 / Math.sqrt(rough / count || 1)));
-  const base = lens.mirror ? high + 0.2 * Math.max(...lens.size) : lens.zIn, size = Math.hypot(2 * rx, 2 * ry);
+    const [c0, cx, cy, cq] = dots.map((d, m) => d / norms[m]);
+    let rough = 0;
+    for (let i = 0, k = 0; i < nx; i++) {
+      for (let j = 0; j < ny; j++, k++) rough += square(grid.zx[k] - cx - 2 * cq * xs[i]) + square(grid.zy[k] - cy - 2 * cq * ys[j]);
+    }
+    const height = (i, j, k) => { const f = c0 + cx * xs[i] + cy * ys[j] + cq * (square(xs[i]) + square(ys[j]) - q0); return f + k * (grid.z[i * ny + j] - f); };
+    const slopes = (i, j, k) => [[grid.zx, cx, xs[i]], [grid.zy, cy, ys[j]]].map(([of, c, x]) => { const f = c + 2 * cq * x; return f + k * (of[i * ny + j] - f); });
+    return { c0, rough: Math.sqrt(rough / count), height, slopes };
+  };
+  const exit = sideOf(cloud), { c0 } = exit, flat = lens.mirror ? most(cloud.z) + 0.2 * Math.max(...lens.size) : lens.zIn;
+  const entrance = cloud.entrance ? sideOf(cloud.entrance) : { c0: flat, rough: 0, height: () => flat, slopes: () => [0, 0] };
+  const usual = Math.min(DEEPEST, Math.max(1, 0.25 / (Math.max(exit.rough, entrance.rough) || 1)));
 
   function draw() {
     if (!canvas.clientWidth) return;
@@ -498,7 +634,7 @@ function solidView(canvas, cloud) {
     const depth = new Float32Array(width * height).fill(-Infinity), k = view.relief, dark = matchMedia("(prefers-color-scheme: dark)").matches;
     const ca = Math.cos(view.yaw), sa = Math.sin(view.yaw), cb = Math.cos(view.pitch), sb = Math.sin(view.pitch);
     const axes = [[ca, -sa, 0], [sa * cb, ca * cb, -sb], [sa * sb, ca * sb, cb]]; // right, up and towards the eye
-    const scale = (0.86 * height * view.zoom) / size, middle = 0.5 * (c0 + base);
+    const scale = (0.86 * height * view.zoom) / size, middle = 0.5 * (c0 + entrance.c0);
     const light = [-0.45, 0.6, 0.66], half = [-0.25, 0.33, 0.91]; // to the lamp, and halfway from there to the eye
     const shade = (gx, gy, gz) => {
       const l = 1 / Math.sqrt(gx * gx + gy * gy + gz * gz), e = axes.map((a) => (a[0] * gx + a[1] * gy + a[2] * gz) * l);
@@ -517,19 +653,18 @@ function solidView(canvas, cloud) {
       }
     };
     const thin = Math.max(1, 2 ** Math.floor(Math.log2(Math.max(1, (1.2 * (nx - 1)) / (2 * rx * scale)))));
-    const flat = shade(0, 0, lens.mirror ? 1 : -1), surface = (i, j, at) => fit(xs[i], ys[j]) + k * (cloud.z[at] - fit(xs[i], ys[j])) - middle;
+    const shaded = (side, i, j, way) => { const [gx, gy] = side.slopes(i, j, k); return shade(-way * gx, -way * gy, way); };
     for (let i = 0; i < nx; i += thin) {
       for (let j = 0; j < ny; j += thin) {
         if (lens.round && square(xs[i]) + square(ys[j]) > rx * rx) continue;
-        const at = i * ny + j, fx = cx + 2 * cq * xs[i], fy = cy + 2 * cq * ys[j], way = axes[2][2] > 0 ? 1 : -1;
-        dot(xs[i], ys[j], surface(i, j, at), shade(-way * (fx + k * (cloud.zx[at] - fx)), -way * (fy + k * (cloud.zy[at] - fy)), way));
-        dot(xs[i], ys[j], base - middle, flat);
+        dot(xs[i], ys[j], exit.height(i, j, k) - middle, shaded(exit, i, j, axes[2][2] > 0 ? 1 : -1));
+        dot(xs[i], ys[j], entrance.height(i, j, k) - middle, shaded(entrance, i, j, lens.mirror ? 1 : -1));
       }
     }
     const wall = (x, y, gx, gy) => {
-      const i = Math.round(((x / rx + 1) / 2) * (nx - 1)), j = Math.round(((y / ry + 1) / 2) * (ny - 1)), top = surface(i, j, i * ny + j);
-      const steps = Math.ceil(1.2 * scale * Math.abs(top - base + middle)) + 1, colour = shade(gx, gy, 0);
-      for (let s = 0; s < steps; s++) dot(x, y, base - middle + (s / steps) * (top - base + middle), colour);
+      const i = Math.round(((x / rx + 1) / 2) * (nx - 1)), j = Math.round(((y / ry + 1) / 2) * (ny - 1)), top = exit.height(i, j, k), base = entrance.height(i, j, k);
+      const steps = Math.ceil(1.2 * scale * Math.abs(top - base)) + 1, colour = shade(gx, gy, 0);
+      for (let s = 0; s < steps; s++) dot(x, y, base - middle + (s / steps) * (top - base), colour);
     };
     const around = Math.ceil(1.2 * scale * Math.PI * 2 * rx);
     if (lens.round) for (let s = 0; s < around; s++) { const w = (2 * Math.PI * s) / around; wall(rx * Math.cos(w), ry * Math.sin(w), Math.cos(w), Math.sin(w)); }
@@ -583,7 +718,7 @@ function ranges() {
   const wide = ((0.15 * across) / far) * (first.near ? at : 180 / Math.PI); // blurs 15 % of the screen
   return {
     sign,
-    throw: { value: sign * screen.z, min: 0.3 * sign * screen.z, max: 2 * sign * screen.z, unit: "mm" },
+    throw: screen.focal ? null : { value: sign * screen.z, min: 0.3 * sign * screen.z, max: 2 * sign * screen.z, unit: "mm" },
     leanx: { value: 0, min: -15, max: 15, unit: "°" },
     leany: { value: 0, min: -15, max: 15, unit: "°" },
     size: { value: size, min: 0, max: Math.max(2 * size, wide), unit: first.near ? "mm" : "°" },
@@ -595,14 +730,17 @@ const tidy = (v, digits = 5) => Number(v.toPrecision(digits));
 async function start() {
   if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the page's data.");
   const { cloud, target, waves, wavesColour } = await unpacked(), range = ranges(), asked = new URLSearchParams(location.hash.slice(1));
-  const names = ["throw", "leanx", "leany", "size"], touched = new Set();
+  const names = ["throw", "leanx", "leany", "size"].filter((name) => range[name]), touched = new Set();
+  const areas = areasOf(cloud.shape), dense = (light) => (areas ? Float64Array.from(light, (v, k) => v / areas[k]) : light); // irradiance
+  byId("throw-control").hidden = !range.throw;
   solidView(byId("solid"), cloud);
-  byId("scale").textContent = `${held.screen.resolution.map((m, k) => tidy(m * held.screen.pixel[k], 4)).join(" × ")} mm, ${held.screen.resolution.join(" × ")} pixels.`;
+  byId("scale").textContent = `${held.screen.resolution.map((m, k) => tidy(m * held.screen.pixel[k], 4)).join(" × ")} ${held.screen.unit}, ${held.screen.resolution.join(" × ")} pixels.`;
   byId("size-name").textContent = held.lights[0].near ? "Size of the source" : "Angular size of the source";
   byId("size-unit").textContent = range.size.unit;
-  if (target) paintLight(byId("target"), target, most(target));
+  const aim = target && dense(target), brightest = (light) => (target ? (most(aim) / sum(target)) * sum(light) : most(dense(light)));
+  if (target) paintLight(byId("target"), aim, most(aim));
   for (const id of target ? [] : ["target-figure", "difference-figure", "rms-row"]) byId(id).hidden = true;
-  if (waves) paintLight(byId("waves"), waves, target ? (most(target) / sum(target)) * sum(waves) : most(waves), wavesColour);
+  if (waves) paintLight(byId("waves"), dense(waves), brightest(waves), wavesColour && wavesColour.map(dense));
   if (waves && target) byId("waves-rms").textContent = compared(waves, target).rms.toFixed(3);
   for (const id of ["waves-figure", "waves-row"]) byId(id).hidden = !waves || (id === "waves-row" && !target);
 
@@ -647,7 +785,7 @@ async function start() {
   /** What the controls say; what was not touched is exactly as designed. */
   const setting = () => {
     const read = (name) => (touched.has(name) ? Number(byId(`${name}-number`).value) : range[name].value);
-    return { z: range.sign * read("throw"), leanX: read("leanx"), leanY: read("leany"), size: touched.has("size") ? read("size") : null };
+    return { z: range.throw ? range.sign * read("throw") : held.screen.z, leanX: read("leanx"), leanY: read("leany"), size: touched.has("size") ? read("size") : null };
   };
 
   let turn = 0;
@@ -681,9 +819,8 @@ async function start() {
   }
 
   function show({ image, planes }, beams, thin, began) {
-    const total = sum(image), white = target ? (most(target) / sum(target)) * total : most(image);
-    paintLight(byId("caustic"), image, white, planes);
-    byId("light").textContent = `${(100 * total).toFixed(1)} %`;
+    paintLight(byId("caustic"), dense(image), brightest(image), planes && planes.map(dense));
+    byId("light").textContent = `${(100 * sum(image)).toFixed(1)} %`;
     if (target) {
       const { error, rms } = compared(image, target);
       paintDifference(byId("difference"), error);

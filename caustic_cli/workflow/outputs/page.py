@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from caustic_cli import __version__
-from caustic_cli.export.page import PAGE, TRACED, write_page
+from caustic_cli.export.page import PAGE, TRACED, entrance_grid, write_page
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.io.files import destination
 from caustic_cli.optics.plan import Plan
@@ -81,10 +81,12 @@ def _lens_rows(lens: Lens) -> list[tuple[str, str]]:
     size = f"round, {_size(one.size[:1])} across" if one.opening.round else _size(one.size)
     if one.mirror:
         return [("Mirror", f"{size}; the side towards the light reflects"), depth, steepest]
+    flat = one.entrance is None
+    wall = z - one.z_in - (0.0 if flat else entrance_grid(one, (SAMPLES, SAMPLES)).z[inside])
     return [
-        ("Lens", f"{size}; flat where light enters, free-form where it leaves"),
+        ("Lens", f"{size}; {'flat where light enters, free-form where it leaves' if flat else 'free-form on both sides'}"),
         ("Refractive index", f"{one.index:.6g}" + (f" ({one.glass})" if one.glass else "")),
-        ("Wall", f"{z.min() - one.z_in:.4f} mm where it is thinnest, {z.max() - one.z_in:.4f} mm where it is thickest"),
+        ("Wall", f"{wall.min():.4f} mm where it is thinnest, {wall.max():.4f} mm where it is thickest"),
         depth,
         steepest,
     ]
@@ -93,10 +95,12 @@ def _lens_rows(lens: Lens) -> list[tuple[str, str]]:
 def _light_rows(scene: Scene) -> list[tuple[str, str]]:
     source, screen = scene.source, scene.screen
     centre = "" if source.distant else f", its middle at {', '.join(f'{c:.6g}' for c in source.centre)} mm"
+    throw = "the far field" if screen.far else f"{abs(screen.z):.6g} mm from the origin, on the {scene.lens.kind}, to the screen"
+    shape = f", {screen.shape_words()}" if screen.curved else ""
     return [
         ("Light", f"{source.kind}: {source.extent_words(scene.lens.z_in)}{centre}"),
-        ("Throw", f"{abs(screen.z):.6g} mm from the origin, on the {scene.lens.kind}, to the screen"),
-        ("Screen", f"{_size(screen.size)}, {_size(screen.resolution, '')} pixels"),
+        ("Throw", throw),
+        ("Screen", f"{_size(screen.size, f' {screen.unit}')}, {_size(screen.resolution, '')} pixels{shape}"),
     ]
 
 
