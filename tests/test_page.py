@@ -27,7 +27,9 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, FreeForm, Lens, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.screen import Sags
-from caustic_cli.scene.sources.several import light_of_all, together
+from caustic_cli.scene.sources.gaussian import Gaussian
+from caustic_cli.scene.sources.measured_beam import MeasuredBeam
+from caustic_cli.scene.sources.several import Several, light_of_all, together
 from caustic_cli.studies.metrics import relative_rms
 
 #: Relative RMS by which page and render may differ; render's own noise is part of it.
@@ -320,6 +322,9 @@ FAR = Screen((120.0, 96.0), 1000.0, (40, 32), far=True)
 ASIDE = replace(FAR, tilt=(5.0, 3.0, 20.0), shift=(-60.0, -100.0))
 BENT = replace(SQUARE.screen, size=(36.0, 33.0), shift=(1.0, -2.0), tilt=(12.0, -8.0))
 WAVY = 1.5 * np.sin(np.linspace(-3.0, 2.0, 33))[:, None] * np.cos(np.linspace(-1.0, 3.0, 29))
+UNEVEN = 0.2 + np.add.outer(np.arange(7.0) ** 2 / 36.0, np.arange(5.0) / 4.0)
+PHASE = np.add.outer(30.0 * np.linspace(-1.0, 1.0, 60) ** 2, 12.0 * np.linspace(-1.0, 1.0, 50) ** 3)
+MIRROR, ONE = replace(SQUARE.lens, mirror=True), (((), ()), ((), ()))
 #: Scenes, and each with one of its parts left out or wrong, whose image is another.
 BEYOND = {
     "free-form entrance": (FRONTED, replace(FRONTED, lens=replace(FRONTED.lens, entrance=None))),
@@ -355,12 +360,28 @@ BEYOND = {
         replace(SQUARE, screen=replace(BENT, sags=Sags(WAVY, BENT.size))),
         replace(SQUARE, screen=replace(BENT, sags=Sags(WAVY[::-1].copy(), BENT.size))),
     ),
+    "laser beam": (
+        replace(SQUARE, source=Gaussian((3.0, 5.0), 633.0, tilt=(4.0, -3.0))),
+        replace(SQUARE, source=PlaneWave(tilt=(4.0, -3.0))),
+    ),
+    "laser beam with a curved wavefront, far field of both sides": (
+        replace(FRONTED, source=Gaussian((0.02, 0.03), 633.0, waist_at=-250.0), screen=replace(FAR, size=(240.0, 200.0))),
+        replace(FRONTED, source=Gaussian((3.0, 3.0), 633.0), screen=replace(FAR, size=(240.0, 200.0))),
+    ),
+    "measured beam, mirror": (
+        replace(SQUARE, source=MeasuredBeam(PHASE, 10600.0, UNEVEN), lens=MIRROR, screen=replace(SQUARE.screen, z=-60.0)),
+        replace(SQUARE, source=PlaneWave(), lens=MIRROR, screen=replace(SQUARE.screen, z=-60.0)),
+    ),
+    "plane waves, each with a profile": (
+        replace(SQUARE, source=Several((PlaneWave(profile=UNEVEN), PlaneWave(tilt=(6.0, 0.0), profile=UNEVEN[::-1].copy())), ONE)),
+        replace(SQUARE, source=Several((PlaneWave(), PlaneWave(tilt=(6.0, 0.0))), ONE)),
+    ),
 }
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's functions")
 @pytest.mark.parametrize("name", BEYOND)
-def test_both_sides_far_fields_and_curved_screens_are_traced_as_render_does(name, tmp_path):
+def test_whatever_a_scene_has_is_traced_as_render_does(name, tmp_path):
     """The image is that of `expose`, not one that is mirrored, a pixel aside or of a scene that differs in one thing."""
     scene, other = BEYOND[name]
     field, z = HeightField.of(scene.lens), heights(0.02 if scene.screen.far else 0.01)
@@ -374,7 +395,9 @@ def test_both_sides_far_fields_and_curved_screens_are_traced_as_render_does(name
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
-@pytest.mark.parametrize("name", ["free-form entrance, at an angle", "far field of both sides, source nearby", "dome"])
+@pytest.mark.parametrize(
+    "name", ["free-form entrance, at an angle", "far field of both sides, source nearby", "dome", "measured beam, mirror"]
+)
 def test_the_graphics_processor_traces_them_as_the_processor_does(name, tmp_path):
     scene, _ = BEYOND[name]
     field, z, page = HeightField.of(scene.lens), heights(0.01), tmp_path / "page.html"

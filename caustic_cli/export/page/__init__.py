@@ -37,7 +37,7 @@ from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.scene import Lens, Scene, Screen, Source
+from caustic_cli.scene import Lens, Pupil, Scene, Screen, Source
 from caustic_cli.scene.traits import Capability
 
 #: Cells of the grid along its longer side, the finest that fits is used; multiples of COARSEST, by which the page subsamples it.
@@ -49,6 +49,8 @@ MOST, MOST_CLOUD = 5_000_000, 3_400_000
 LEVEL = 6
 #: Points along each axis of the shape of a curved screen.
 SHAPE = 257
+#: Points along each axis of the irradiance and direction of uneven light, of a single source; several share as many.
+FRONT = 385
 #: Pixels of the page's screen across, at most; a finer target is averaged down to them.
 PIXELS = 512
 #: Most positions of a source; more are subsampled evenly.
@@ -136,9 +138,10 @@ def write_page(
         "rows": _table(rows),
         "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes),
     }
+    fronts = sum(_length(light["front"]) for light in data["lights"] if light.get("front"))
     for cells in CELLS:
         cloud = _cloud(scene, field, heights, cells)
-        if _length(cloud) <= MOST_CLOUD or cells == CELLS[-1]:
+        if _length(cloud) + fronts <= MOST_CLOUD or cells == CELLS[-1]:
             break
     page = _assembled(words, data | {"cloud": cloud}).encode()
     assert len(page) <= MOST, len(page)
@@ -199,16 +202,14 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def _cloud(scene: Scene, field: HeightField, heights: Tensor, cells: int) -> dict:
-    """The exit surface, the entrance surface if it is free-form, and the profile of a plane wave, on a regular grid over the
-    aperture."""
-    lens, profile = scene.lens, scene.source.profile
+    """The exit surface, and the entrance surface if it is free-form, on a regular grid over the aperture."""
+    lens = scene.lens
     counts = tuple(COARSEST * max(1, round(cells * w / max(lens.size) / COARSEST)) + 1 for w in lens.size)
     exit = sample_grid(field, heights, counts)
     entrance = None if lens.entrance is None else entrance_grid(lens, counts)
     return {
         "exit": _surface(exit.z, exit.zx, exit.zy),
         "entrance": None if entrance is None else _surface(lens.z_in + entrance.z, entrance.zx, entrance.zy),
-        "profile": None if profile is None else _coded(_at_points(profile, counts)),
     }
 
 
@@ -228,10 +229,18 @@ def _length(held: dict) -> int:
     return len(held["data"]) if "data" in held else sum(_length(part) for part in held.values() if part)
 
 
-def _at_points(profile: np.ndarray, counts: tuple[int, int]) -> np.ndarray:
-    """A profile over its mean, by nearest cell, at the points of a regular grid over the aperture, borders included."""
-    at = [np.minimum((np.linspace(0.0, 1.0, n) * m).astype(int), m - 1) for n, m in zip(counts, profile.shape, strict=True)]
-    return (profile / profile.mean())[np.ix_(*at)]
+def _front(source: Source, pupil: Pupil, points: int) -> dict | None:
+    """Irradiance over its mean of uneven light from infinity, and the sines along x and y of its directions to its axis, on a
+    regular grid of so many points along each axis of the pupil; None for a plane wave of uniform irradiance."""
+    if not source.uneven:
+        return None
+    x, y = (np.linspace(-r, r, points) for r in pupil.half_size)
+    x, y = x[:, None], y[None, :]
+    lit = np.broadcast_to(source.irradiance(x, y, pupil) / source.passed(pupil), (points, points))
+    if source.beam is None:
+        return _surface(lit, *np.zeros((2, points, points)))
+    directions = source.beam(x, y, pupil).directions[:2]
+    return _surface(lit, *(np.broadcast_to(d, lit.shape) - axis for d, axis in zip(directions, source.axis[:2], strict=True)))
 
 
 def _coarser(screen: Screen) -> Screen:
@@ -281,18 +290,20 @@ def _lights(scene: Scene) -> list[dict]:
             {
                 "weight": scene.source.fractions[k],
                 "indices": [[index, *of] for index, of in indices.items()],
-                **_source(one, one.source),
+                **_source(one, one.source, round(FRONT / math.sqrt(len(scene.by_source)))),
             }
         )
     return lights
 
 
-def _source(scene: Scene, source: Source) -> dict:
+def _source(scene: Scene, source: Source, points: int) -> dict:
     """Positions relative to the centre of the entrance, mm, with their weights; half sizes; the axis of light from infinity; the
     cone and i(theta) as a function of s."""
     if source.distant:
         wide = math.sin(source.half_angle)
-        light = {"extent": [wide, wide], "axis": list(source.axis), "picture": _picture(source)}
+        extent = [wide, wide] if source.beam is None else list(source.frame)
+        front = _front(source, scene.lens.pupil, points)
+        light = {"extent": extent, "axis": list(source.axis), "picture": _picture(source), "front": front}
         return {"near": False, "places": [[0.0, 0.0, 0.0, 1.0]], **light}
     (places, parts), lens = source.points(), scene.lens
     if len(places) > PLACES:

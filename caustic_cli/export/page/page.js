@@ -58,9 +58,10 @@ async function gridOf(part, reach) {
 }
 
 async function unpacked() {
-  const { exit, entrance, profile } = held.cloud, reach = held.lens.size.map((s) => s / 2);
-  const cloud = { ...(await gridOf(exit, reach)), profile: profile && (await decoded(profile)), entrance: await gridOf(entrance, reach) };
+  const { exit, entrance } = held.cloud, reach = held.lens.size.map((s) => s / 2);
+  const cloud = { ...(await gridOf(exit, reach)), entrance: await gridOf(entrance, reach) };
   cloud.shape = await gridOf(held.screen.shape, held.screen.low.map(Math.abs));
+  for (const light of held.lights) light.grid = await gridOf(light.front, reach);
   const target = held.target && (await decoded(held.target)), waves = held.waves && (await decoded(held.waves));
   const wavesColour = held.wavesColour && (await Promise.all(held.wavesColour.map(decoded)));
   return { cloud, target, waves, wavesColour };
@@ -190,8 +191,10 @@ function gridAt({ nx, ny, z, zx, zy, reach: [rx, ry] }) {
 /** The entrance of a lens as a function that finds how the light of a beam reaches a point of the exit: a, d, e, q and glass of `ray`,
  * the power w per area of the pupil, and `lost`, the part that the entrance reflects. */
 function entranceOf(cloud) {
-  const { lens } = held, surface = cloud.entrance ? gridAt(cloud.entrance) : flatAt(lens.zIn);
+  const { lens } = held, surface = cloud.entrance ? gridAt(cloud.entrance) : flatAt(lens.zIn), wave = {};
+  const fronts = new Map(held.lights.map((light) => [light, light.grid && gridAt(light.grid)])); // of irradiance, and sines to the axis
   return (beam, x, y, z, ray) => {
+    const front = fronts.get(beam.light);
     const { n, near, x0, y0, h } = beam, z0 = lens.zIn - h, t = z - lens.zIn;
     let ax = beam.ax, ay = beam.ay, az = near ? 1 : Math.sqrt(1 - ax * ax - ay * ay), away = 0; // 1 / distance from the source
     let ex = near ? (x * h + x0 * (t / n)) / (h + t / n) : x - (t * ax) / Math.sqrt(n * n - ax * ax - ay * ay);
@@ -202,6 +205,9 @@ function entranceOf(cloud) {
         ax = ex - x0; ay = ey - y0; az = ray.s - z0;
         away = 1 / Math.sqrt(ax * ax + ay * ay + az * az);
         ax *= away; ay *= away; az *= away;
+      } else if (front) {
+        front(ex, ey, wave);
+        ax = beam.ax + wave.sx; ay = beam.ay + wave.sy; az = Math.sqrt(1 - ax * ax - ay * ay);
       }
       if (n === 1 || step === STEPS) break; // the straight path is exact without refraction
       let dx = x - ex, dy = y - ey, dz = z - ray.s;
@@ -209,9 +215,10 @@ function entranceOf(cloud) {
       dx *= r; dy *= r; dz *= r;
       const gz = az - n * dz, gx = ax - n * dx + gz * sx, gy = ay - n * dy + gz * sy; // the optical path's gradient by e, its Hessian
       const au = ax + az * sx, av = ay + az * sy, du = dx + dz * sx, dv = dy + dz * sy;
-      const hxx = away * (1 + sx * sx - au * au) + n * r * (1 + sx * sx - du * du) + gz * ray.sxx;
-      const hyy = away * (1 + sy * sy - av * av) + n * r * (1 + sy * sy - dv * dv) + gz * ray.syy;
-      const hxy = away * (sx * sy - au * av) + n * r * (sx * sy - du * dv) + gz * ray.sxy;
+      let hxx = away * (1 + sx * sx - au * au) + n * r * (1 + sx * sx - du * du) + gz * ray.sxx;
+      let hyy = away * (1 + sy * sy - av * av) + n * r * (1 + sy * sy - dv * dv) + gz * ray.syy;
+      let hxy = away * (sx * sy - au * av) + n * r * (sx * sy - du * dv) + gz * ray.sxy;
+      if (front) { hxx += wave.sxx; hyy += wave.syy; hxy += wave.sxy; }
       const det = hxx * hyy - hxy * hxy, mx = (hyy * gx - hxy * gy) / det, my = (hxx * gy - hxy * gx) / det;
       ex -= mx; ey -= my;
       if (mx * mx + my * my < FINE * FINE) step = STEPS - 1;
@@ -222,6 +229,7 @@ function entranceOf(cloud) {
     ray.ex = ex; ray.ey = ey; ray.glass = (z - s) / ray.dz;
     ray.qx = ex + ((lens.zIn - s) * ax) / az; ray.qy = ey + ((lens.zIn - s) * ay) / az;
     ray.w = near ? (intensity(beam, ax, ay, az) * az * az * az) / (h * h) : 1;
+    if (front) { front(ray.qx, ray.qy, wave); ray.w *= wave.s; }
     ray.lost = lens.fresnel && n > 1 ? reflectance(lens.fresnel, c / Math.sqrt(norm2), root / (n * Math.sqrt(norm2)), 1 / n) : 0;
   };
 }
@@ -255,9 +263,6 @@ function screenAt(cloud, z) {
   };
 }
 
-/** The index of a grid's point, of n along an axis, that is nearest to u on [-1, 1]. */
-const nearest = (u, n) => Math.min(n - 1, Math.max(0, Math.round(0.5 * (u + 1) * (n - 1))));
-
 /** A function that traces the corners of row i of the grid, every `thin`-th point, into `row`; the screen is at z. */
 function rowTracer(cloud, z, thin) {
   const { lens } = held, { fresnel } = lens, { ny } = cloud, [rx, ry] = lens.size.map((s) => s / 2);
@@ -269,7 +274,6 @@ function rowTracer(cloud, z, thin) {
       enter(beam, x, y, height, ray);
       const { dx, dy, dz } = ray;
       let w = ray.w * beam.power;
-      if (cloud.profile) w *= cloud.profile[nearest(ray.qx / rx, cloud.nx) * ny + nearest(ray.qy / ry, ny)];
       // the exit: N = (-zx, -zy, 1), c = d . N, s = t . N
       const norm2 = 1 + zx * zx + zy * zy, c = dz - dx * zx - dy * zy;
       let ox, oy, oz;
@@ -349,8 +353,8 @@ function* tracedHere(cloud, beams, z, thin) {
 
 const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D;
-uniform sampler2D cloud, table, entrance, shape; uniform ivec2 points; uniform int thin;
-uniform bool near, isRound, isMirror, cut, bent, curved; uniform int fresnel;
+uniform sampler2D cloud, table, entrance, shape, front; uniform ivec2 points; uniform int thin;
+uniform bool near, isRound, isMirror, cut, bent, curved, uneven; uniform int fresnel;
 uniform vec3 origin, axis, u, v, normal; uniform vec2 direction, radius, middle, low, pixel, reach, offset; uniform vec4 frame;
 uniform float n, power, zIn, absorption, chord, z, largest, smallest, focal, forward;
 flat out vec4 box; flat out float each;
@@ -377,15 +381,16 @@ vec3 onGrid(sampler2D grid, vec2 reach, vec2 at, out vec3 bend) {
 void enter(vec3 to, out vec3 d, out vec2 e, out vec2 q, out float w, out float lost, out float glass) {
   float h = origin.z, t = to.z - zIn, away = 0.0; vec3 a = vec3(direction, near ? 1.0 : sqrt(1.0 - dot(direction, direction)));
   e = near ? (to.xy * h + origin.xy * (t / n)) / (h + t / n) : to.xy - t * direction / sqrt(n * n - dot(direction, direction));
-  vec3 p = vec3(zIn, 0.0, 0.0), bend = vec3(0.0);
+  vec3 p = vec3(zIn, 0.0, 0.0), bend = vec3(0.0), curl = vec3(0.0);
   for (int step = 0; ; step++) {
     if (bent) p = onGrid(entrance, radius, e, bend);
     if (near) { vec2 side = e - origin.xy; float up = p.x - zIn + h; away = inversesqrt(dot(side, side) + up * up); a = vec3(side, up) * away; }
+    else if (uneven) { a.xy = direction + onGrid(front, radius, e, curl).yz; a.z = sqrt(1.0 - dot(a.xy, a.xy)); }
     if (n == 1.0 || step == 6) break;
     vec3 way = to - vec3(e, p.x); float r = inversesqrt(dot(way, way)); way *= r;
     float gz = a.z - n * way.z; vec2 g = a.xy - n * way.xy + gz * p.yz, s = a.xy + a.z * p.yz, o = way.xy + way.z * p.yz;
     vec3 hessian = away * vec3(1.0 + p.y * p.y - s.x * s.x, p.y * p.z - s.x * s.y, 1.0 + p.z * p.z - s.y * s.y)
-      + n * r * vec3(1.0 + p.y * p.y - o.x * o.x, p.y * p.z - o.x * o.y, 1.0 + p.z * p.z - o.y * o.y) + gz * bend;
+      + n * r * vec3(1.0 + p.y * p.y - o.x * o.x, p.y * p.z - o.x * o.y, 1.0 + p.z * p.z - o.y * o.y) + gz * bend + curl;
     e -= vec2(hessian.z * g.x - hessian.y * g.y, hessian.x * g.y - hessian.y * g.x) / (hessian.x * hessian.z - hessian.y * hessian.y);
   }
   float norm2 = 1.0 + dot(p.yz, p.yz), c = a.z - dot(a.xy, p.yz), denser = (n - 1.0) * (n + 1.0), root = sqrt(c * c + denser * norm2);
@@ -393,7 +398,7 @@ void enter(vec3 to, out vec3 d, out vec2 e, out vec2 q, out float w, out float l
   glass = (to.z - p.x) / d.z;
   if (!bent) e = to.xy - glass * d.xy; // from the exit: differences of near numbers
   q = e + (zIn - p.x) / a.z * a.xy;
-  w = near ? intensity(a) * a.z * (a.z / h) * (a.z / h) : 1.0;
+  w = near ? intensity(a) * a.z * (a.z / h) * (a.z / h) : uneven ? onGrid(front, radius, q, curl).x : 1.0;
   lost = fresnel > 0 && n > 1.0 ? reflectance(c / sqrt(norm2), root / (n * sqrt(norm2)), 1.0 / n) : 0.0;
 }
 bool meet(vec3 from, vec3 o, out vec2 landing) {
@@ -412,7 +417,7 @@ bool corner(ivec2 at, out vec2 landing, out vec2 e, out vec2 q, out float w) {
   vec2 xy = (2.0 * vec2(at) / vec2(points - 1) - 1.0) * radius;
   vec3 d; float lost, glass;
   enter(vec3(xy, p.x), d, e, q, w, lost, glass);
-  w *= power * texelFetch(cloud, clamp(ivec2(0.5 * (q / radius + 1.0) * vec2(points - 1) + 0.5), ivec2(0), points - 1).yx, 0).w;
+  w *= power;
   float norm2 = 1.0 + dot(p.yz, p.yz), c = d.z - dot(d.xy, p.yz); vec3 o;
   if (isMirror) { float twice = 2.0 * c / norm2; o = vec3(d.xy + twice * p.yz, d.z - twice); }
   else {
@@ -479,15 +484,16 @@ function graphicsTracer(cloud, slowToo) {
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
     return made;
   };
-  const surface = (unit, grid, fourth) => {
+  const surface = (unit, grid) => {
     const texels = new Float32Array(4 * grid.z.length);
-    for (let k = 0; k < grid.z.length; k++) texels.set([grid.z[k], grid.zx[k], grid.zy[k], fourth ? fourth[k] : 1], 4 * k);
-    texture(unit, gl.RGBA32F, grid.ny, grid.nx, gl.RGBA, texels);
+    for (let k = 0; k < grid.z.length; k++) texels.set([grid.z[k], grid.zx[k], grid.zy[k], 1], 4 * k);
+    return texture(unit, gl.RGBA32F, grid.ny, grid.nx, gl.RGBA, texels);
   };
-  surface(0, cloud, cloud.profile);
+  surface(0, cloud);
   if (cloud.entrance) surface(3, cloud.entrance);
   if (cloud.shape) surface(4, cloud.shape);
   const tables = held.lights.map((light) => light.near && texture(1, gl.R32F, light.intensity.length, 1, gl.RED, new Float32Array(light.intensity)));
+  const fronts = held.lights.map((light) => light.grid && surface(5, light.grid));
   const sum = texture(2, gl.RGBA32F, wide, tall, gl.RGBA, null);
   gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
   gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, sum, 0);
@@ -497,7 +503,7 @@ function graphicsTracer(cloud, slowToo) {
   const { lens, screen } = held;
   gl.viewport(0, 0, wide, tall);
   gl.enable(gl.BLEND); gl.blendFunc(gl.ONE, gl.ONE); gl.disable(gl.DEPTH_TEST);
-  gl.uniform1i(at("cloud"), 0); gl.uniform1i(at("table"), 1); gl.uniform1i(at("entrance"), 3); gl.uniform1i(at("shape"), 4);
+  gl.uniform1i(at("cloud"), 0); gl.uniform1i(at("table"), 1); gl.uniform1i(at("entrance"), 3); gl.uniform1i(at("shape"), 4); gl.uniform1i(at("front"), 5);
   gl.uniform1i(at("bent"), Boolean(cloud.entrance)); gl.uniform1i(at("curved"), Boolean(cloud.shape));
   if (cloud.shape) gl.uniform2f(at("reach"), ...cloud.shape.reach);
   gl.uniform1f(at("focal"), screen.focal); gl.uniform1f(at("forward"), screen.facing ? 1 : -1); gl.uniform2f(at("offset"), ...farCentre());
@@ -509,7 +515,7 @@ function graphicsTracer(cloud, slowToo) {
   gl.uniform1f(at("zIn"), lens.zIn); gl.uniform1f(at("absorption"), lens.absorption);
   gl.uniform1f(at("smallest"), SMALLEST); gl.uniform1f(at("largest"), gl.getParameter(gl.ALIASED_POINT_SIZE_RANGE)[1] - 2);
   const told = gl.getExtension("WEBGL_debug_renderer_info"), name = told ? String(gl.getParameter(told.UNMASKED_RENDERER_WEBGL)) : "";
-  const where = Object.fromEntries(["near", "origin", "axis", "cut", "chord", "direction", "n", "power", "z", "middle", "thin"].map((key) => [key, at(key)]));
+  const where = Object.fromEntries(["near", "uneven", "origin", "axis", "cut", "chord", "direction", "n", "power", "z", "middle", "thin"].map((key) => [key, at(key)]));
 
   function* traced(beams, z, thin) {
     gl.clearColor(0, 0, 0, 0); gl.clear(gl.COLOR_BUFFER_BIT);
@@ -520,7 +526,10 @@ function graphicsTracer(cloud, slowToo) {
         gl.uniform3f(where.origin, beam.x0, beam.y0, beam.h); gl.uniform3f(where.axis, ...beam.axis);
         gl.uniform1i(where.cut, beam.light.cut); gl.uniform1f(where.chord, beam.light.chord);
         gl.activeTexture(gl.TEXTURE1); gl.bindTexture(gl.TEXTURE_2D, tables[held.lights.indexOf(beam.light)]);
-      } else gl.uniform2f(where.direction, beam.ax, beam.ay);
+      } else {
+        gl.uniform2f(where.direction, beam.ax, beam.ay); gl.uniform1i(where.uneven, Boolean(beam.light.grid));
+        gl.activeTexture(gl.TEXTURE5); gl.bindTexture(gl.TEXTURE_2D, fronts[held.lights.indexOf(beam.light)]);
+      }
       gl.drawArrays(gl.POINTS, 0, ((cloud.nx - 1) / thin) * ((cloud.ny - 1) / thin));
       gl.flush();
       yield;
