@@ -27,6 +27,7 @@ from caustic_cli.inverse.lamp import (
     wanted,
 )
 from caustic_cli.inverse.lamp_limits import chip_limits, etendue_limit, least_error
+from caustic_cli.inverse.mirrors import Mirrors
 from caustic_cli.inverse.refractor_transport import envelope, source_directions
 from caustic_cli.optics.lamp import (
     PointGrid,
@@ -42,6 +43,7 @@ from caustic_cli.optics.lamp import (
 from caustic_cli.optics.surfaces.base import SECOND
 from caustic_cli.optics.surfaces.polarfield import PolarField, direction_of, frame, stereographic
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
+from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.studies.lamp import cut_off, lamp_figures
 
 FIELD = PolarField.uniform((12, 9), (3, 4))
@@ -473,7 +475,7 @@ def test_the_loss_is_differentiable_to_second_order_remainders(chip):
 
 @pytest.mark.parametrize("chip", [Chip(), Chip("disc", (2.0, 2.0))])
 def test_the_loss_is_the_same_in_any_number_of_threads(chip, monkeypatch):
-    monkeypatch.setattr("caustic_cli.optics.lamp.CHUNK", 1000)
+    monkeypatch.setattr("caustic_cli.optics.lamp.CHUNK", 300)
     field, goal = PolarField.uniform((10, 10)), Goal((120.0, 120.0))
     found = []
     for threads in (1, 3):
@@ -487,7 +489,54 @@ def test_the_loss_is_the_same_in_any_number_of_threads(chip, monkeypatch):
     assert found[0][0] == found[1][0] and torch.equal(found[0][1], found[1][1])
 
 
+@pytest.mark.parametrize(
+    "goal, picture, planes",
+    [
+        (FAR, np.ones((4, 4)), (True, True)),
+        (FAR, np.outer([1.0, 2.0, 3.0, 4.0], [1.0, 2.0, 2.0, 1.0]), (False, True)),
+        (Goal((5e3, 4e3), 4e3, (0.0, 600.0)), np.ones((4, 4)), (True, False)),
+    ],
+)
+def test_the_light_on_one_side_of_mirror_planes_stands_for_all_of_it(goal, picture, planes, monkeypatch):
+    """Loss and gradient of symmetric surfaces are those by all rays, with a part of them."""
+    lamp, target = Lamp(surfaces=2), wanted(goal, picture, (40, 24))
+    assert Mirrors.of(lamp, goal, target) == planes
+    values = torch.stack([FIELD.sphere(5.0), bumpy()])
+    values, found, rays = Mirrors(*planes).whole(values), [], []
+    for mirrored in (True, False):
+        if not mirrored:
+            monkeypatch.setattr(Mirrors, "of", lambda *_: Mirrors())
+        objective = LampObjective(lamp, goal, FIELD, target, 20_000)
+        start = values.clone().requires_grad_()
+        loss = objective(start)
+        found.append((loss.detach(), Mirrors(*planes).whole(torch.autograd.grad(loss, start)[0])))
+        rays.append(sum(len(grid.power) for grid in objective.rays))
+    torch.testing.assert_close(found[0], found[1], rtol=1e-9, atol=1e-14)
+    assert rays[1] == 2 ** sum(planes) * rays[0]
+
+
+@pytest.mark.parametrize("chip", [Chip("rectangle", (2.0, 1.0)), Chip("disc", (2.0, 2.0))])
+def test_the_places_of_a_chip_on_one_side_carry_all_light(chip):
+    parts = list(chip_grids(chip, 4, 300_000, (True, False)))
+    assert sum(float(part.power.sum()) for part in parts) == pytest.approx(1.0)
+    x, y, _ = (torch.cat([part.origin[k] for part in parts]) for k in range(3))
+    assert float(x.min()) > 0 and abs(float(y.mean())) < 1e-3
+    everywhere = sum(len(part.power) for part in chip_grids(chip, 4, 300_000))
+    assert len(x) == pytest.approx(0.5 * everywhere, rel=1e-3)
+
+
+def test_a_chip_of_a_file_has_no_mirror_planes():
+    rays = RaySet(np.zeros((3, 3)), np.tile([0.0, 0.0, 1.0], (3, 1)), np.ones(3))
+    assert Mirrors.of(Lamp(Chip.of_rays(rays)), FAR, torch.ones(4, 4, dtype=torch.float64)) == (False, False)
+
+
 # Design
+
+
+def test_a_symmetric_target_has_symmetric_surfaces():
+    values = design_lamp(Lamp(), FAR, np.ones((4, 4)), effort=QUICK)
+    for axis in (0, 1):
+        torch.testing.assert_close(values, values.flip(axis), rtol=1e-14, atol=0)
 
 
 def test_a_net_of_more_spans_is_the_same_surface():

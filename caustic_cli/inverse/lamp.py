@@ -27,6 +27,7 @@ from torch.autograd.function import once_differentiable
 from caustic_cli.effort import STANDARD, Effort
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lbfgs import LBFGS
+from caustic_cli.inverse.mirrors import Mirrors
 from caustic_cli.inverse.parametrisation import InverseLaplacian
 from caustic_cli.inverse.refractor_transport import CELLS, source_directions, transported
 from caustic_cli.inverse.target import target_on_screen
@@ -135,7 +136,7 @@ class LampObjective:
 
     Args:
         target: (n_x, n_y) as of `wanted`, FINER times as many along each axis as a stage has.
-        rays: about.
+        rays: about, of which `mirrors` leave those on one side.
         weight: w, see the module; of a chip for a blur as wide as the border, and in proportion to it, since the light at stake at
             the edges is.
         threads: in which parts of the rays are traced.
@@ -145,7 +146,12 @@ class LampObjective:
         point, shape = lamp.chip.shape == "point", (target.shape[0], target.shape[1])
         self.goal, self.weight = goal, weight if point else weight * lamp.blur(goal) / lamp.border(goal)
         self.rays: Sequence[PointGrid | ChipRays]
-        self.rays = PointGrid.of(field, rays, lamp.chip) if point else list(chip_grids(lamp.chip, CHIP_POINTS, rays))
+        self.mirrors = Mirrors.of(lamp, goal, target)
+        self.rays = (
+            PointGrid.of(field, rays, lamp.chip, self.mirrors)
+            if point
+            else list(chip_grids(lamp.chip, CHIP_POINTS, rays, self.mirrors))
+        )
         self.pool = ThreadPoolExecutor(threads)
         self.through = partial(through_point if point else through, lamp, field)
         apron = FINER * APRON
@@ -177,6 +183,7 @@ class LampObjective:
         image, distance, lack = torch.zeros_like(self.target), sum(found[3::5]), sum(found[4::5])
         for x, y, power in zip(found[::5], found[1::5], found[2::5], strict=True):
             image = image + self.splat(x, y, power, self.screen, FILTER)[0]
+        image = self.mirrors.whole(image)
         residual = self.over(image / (image * self.seen).sum() - self.target)
         return (self.weights * residual**2).sum(), (image * self.inside).sum(), distance, lack
 
@@ -298,11 +305,12 @@ def refine(
     on_iteration: called with the number of iterations and the loss.
     """
     # Of the logarithms of the control values, which keeps them positive; their mean affects the image, except around a hemisphere.
-    spread = InverseLaplacian(values, 0.0 if objective.limits is None else 1.0)
+    spread, whole = InverseLaplacian(values, 0.0 if objective.limits is None else 1.0), objective.mirrors.whole
+    values = whole(values)
 
     def evaluate(x: Tensor) -> tuple[float, Tensor]:
         y = x.view(values.shape).clone().requires_grad_()
-        loss = objective(values * spread(y).exp())
+        loss = objective(values * whole(spread(y)).exp())
         (g,) = torch.autograd.grad(loss, y)
         return float(loss.detach()), g.reshape(-1)
 
@@ -312,7 +320,7 @@ def refine(
             break
         on_iteration(k + 1, method.f)
     with torch.no_grad():
-        return values * spread(method.x.view(values.shape)).exp()
+        return values * whole(spread(method.x.view(values.shape))).exp()
 
 
 def initial_lamp(lamp: Lamp, goal: Goal, field: PolarField, picture: np.ndarray, cells: int = CELLS) -> Tensor:
@@ -339,7 +347,7 @@ class Aimed:
 
     def __init__(self, lamp: Lamp, field: PolarField, limits: LampLimits, emitted: Tensor, power: Tensor, aims: Tensor):
         x, y, z = emitted.unbind(1)
-        zero = torch.zeros_like(x)
+        zero, self.mirrors = torch.zeros_like(x), Mirrors()
         self.lamp, self.field, self.aims, self.limits = lamp, field, aims, limits
         self.rays = ChipRays((zero, zero, zero), (x, y, z), power)
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from caustic_cli.optics.interface import reflectance, refract
 from caustic_cli.optics.lamp_side import InnerSide, PolarSide, inner_side
-from caustic_cli.optics.sampling import SOBOL_RAYS, Sample, Sampler, numbers
+from caustic_cli.optics.sampling import SOBOL_RAYS, Sample, numbers
 from caustic_cli.optics.surfaces.polarfield import (
     PolarField,
     PolarHit,
@@ -54,6 +54,8 @@ DENSER, CORNERS = 1.0, 1.1
 #: Steps of an additive sequence that covers the unit square evenly (Roberts 2018, from the plastic number).
 LATTICE = (0.7548776662466927, 0.5698402909980532)
 LAMBERTIAN = Chip()
+#: Of light on either side of the planes x = 0 and y = 0.
+WHOLE = (False, False)
 _DEGREE = 180.0 / math.pi
 #: Squared sine of an angle below which the angle is its sine and the next term of the series.
 NEAR = 1e-8
@@ -138,9 +140,9 @@ def _tabulated(intensity: Distribution, x: Tensor, y: Tensor) -> tuple[Tensor, T
     return scale * x, scale * y
 
 
-def chip_grids(chip: Chip, points: int, count: int) -> Iterator[ChipRays]:
+def chip_grids(chip: Chip, points: int, count: int, halves: tuple[bool, bool] = WHOLE) -> Iterator[ChipRays]:
     """About `count` rays from points x points places of a chip, CHUNK at a time, of unequal power: in a grid of directions
-    (u, v), displaced from place to place by a part of its cells.
+    (u, v), displaced from place to place by a part of its cells.  halves: whether only those from places at x > 0, and at y > 0.
 
     The places have the mean square distances of the chip's points.  Their images are as smooth as those of a `PointGrid`, which a
     design needs more than independence of the rays; those of a ray file are its own.
@@ -152,6 +154,10 @@ def chip_grids(chip: Chip, points: int, count: int) -> Iterator[ChipRays]:
     square = 1.0 / 12.0 if chip.shape == "rectangle" else 1.0 / 16.0
     x, y = (c * (square * d * d / (c * c).mean()).sqrt() for c, d in zip(on_chip(chip, s, t), chip.size, strict=True))
     side = max(1, round(math.sqrt(count / len(x) * 4.0 / math.pi)))
+    kept = torch.stack(
+        [c > 0 if half else torch.ones_like(c, dtype=torch.bool) for half, c in zip(halves, (x, y), strict=True)]
+    ).all(0)
+    x, y = x[kept], y[kept]
     each = max(1, CHUNK // (side * side))
     cells, total = torch.arange(side, dtype=torch.float64), 0.0
     parts = []
@@ -202,10 +208,15 @@ class PointGrid:
         self._surface = field.net.prepare(sample, torch.float64)
 
     @classmethod
-    def of(cls, field: PolarField, count: int, chip: Chip = LAMBERTIAN) -> list[PointGrid]:
-        """About `count` rays of the centre of a chip, CHUNK at a time: small tensors stay in the cache of the processor."""
-        sampler = Sampler.of_size("grid", max(1, round(count * CORNERS)))
-        grids = [cls(field, sample, chip) for sample in sampler.chunks(CHUNK)]
+    def of(cls, field: PolarField, count: int, chip: Chip = LAMBERTIAN, halves: tuple[bool, bool] = WHOLE) -> list[PointGrid]:
+        """About `count` rays of the centre of a chip, CHUNK at a time: small tensors stay in the cache of the processor.
+
+        halves: whether only those towards u > 0, and towards v > 0, whose power is of sum 1 then.
+        """
+        pairs, one = max(1, round(0.5 * math.sqrt(count * CORNERS))), torch.ones((), dtype=torch.float64)
+        cells = (torch.arange(2 * pairs, dtype=torch.float64) + 0.5) / (2 * pairs)
+        u, v = (cells[pairs:] if half else cells for half in halves)
+        grids = [cls(field, Sample(some, v, True, one), chip) for some in u.split(max(1, CHUNK // len(v)))]
         total = sum(float(grid.power.sum()) for grid in grids)
         for grid in grids:
             grid.power /= total
