@@ -112,13 +112,13 @@ class Effort:
         (800, 20_000, 100, 0.1),
         (5_600, 60_000, 150, 0.03),
         (24_000, 600_000, 100, 0.006),
-        (96_000, 1_000_000, 60, 0.006),
+        (96_000, 3_000_000, 60, 0.006),
     )
     #: The same for two free-form surfaces, after the first of the stages above with one.
     two_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 30_000, 150, 0.2),
         (5_600, 60_000, 80, 0.03),
-        (24_000, 500_000, 110, 0.012),
+        (24_000, 600_000, 120, 0.006),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.
     chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_100, 300_000, 90, 0.045),)

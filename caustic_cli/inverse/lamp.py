@@ -41,8 +41,12 @@ from caustic_cli.scene.lamp import Goal, Lamp
 
 #: Squared cosine of the angle of exit below which a ray is near total reflection.
 MARGIN = 0.005
-#: Dark pixels around the target on which light beside it is seen; and the filter of the image.
-APRON, FILTER = 4, Filter("cosine", (3, 3))
+#: Dark pixels around the target on which light beside it is seen.
+APRON = 4
+#: Filters of the image, wide and narrow: of waves as long as two pixels they show 0.17 and 0.30 of the amplitude, pixels themselves
+#: 0.64.  Behind the wide one light at sharp edges oscillates more: the error of a disc was 0.0079 instead of 0.0033.  The narrow
+#: one needs so many rays per pixel: with 6 light within the edges of 17 x 4 m was uneven by 0.007 instead of 0.003.
+WIDE, NARROW, ENOUGH = Filter("cosine", (3, 3)), Filter("gaussian", (3, 3), (2.0, 2.0)), 7
 #: Pixels of a point's loss along either axis in one of a stage.
 FINER = 2
 #: Points of a chip along both of its axes; weight of the pixels on the border that it blurs, and of the apron.
@@ -148,15 +152,15 @@ class LampObjective:
         self.rays: Sequence[PointGrid | ChipRays]
         self.mirrors = Mirrors.of(lamp, goal, target)
         self.rays = (
-            PointGrid.of(field, rays, lamp.chip, self.mirrors)
+            PointGrid.of(field, rays, lamp.chip, self.mirrors, shape[0] / shape[1])
             if point
             else list(chip_grids(lamp.chip, CHIP_POINTS, rays, self.mirrors))
         )
         self.pool = ThreadPoolExecutor(threads)
         self.through = partial(through_point if point else through, lamp, field)
-        apron = FINER * APRON
+        apron, self.filter = FINER * APRON, NARROW if rays >= ENOUGH * target.numel() else WIDE
         self.screen = Screen(goal.size, resolution=shape).grown((apron, apron))
-        smooth = FILTER.smooth(torch.nn.functional.pad(target.double(), (apron,) * 4))
+        smooth = self.filter.smooth(torch.nn.functional.pad(target.double(), (apron,) * 4))
         self.inside = torch.nn.functional.pad(torch.ones_like(target), (apron,) * 4, value=float(point))
         self.seen = torch.ones_like(smooth) if point else self._interior(lamp, shape)
         self.target = smooth / (smooth * self.seen).sum()
@@ -182,7 +186,7 @@ class LampObjective:
         found = _InThreads.apply(values, self._see, self.rays, self.pool)
         image, distance, lack = torch.zeros_like(self.target), sum(found[3::5]), sum(found[4::5])
         for x, y, power in zip(found[::5], found[1::5], found[2::5], strict=True):
-            image = image + self.splat(x, y, power, self.screen, FILTER)[0]
+            image = image + self.splat(x, y, power, self.screen, self.filter)[0]
         image = self.mirrors.whole(image)
         residual = self.over(image / (image * self.seen).sum() - self.target)
         return (self.weights * residual**2).sum(), (image * self.inside).sum(), distance, lack

@@ -208,14 +208,24 @@ class PointGrid:
         self._surface = field.net.prepare(sample, torch.float64)
 
     @classmethod
-    def of(cls, field: PolarField, count: int, chip: Chip = LAMBERTIAN, halves: tuple[bool, bool] = WHOLE) -> list[PointGrid]:
+    def of(
+        cls,
+        field: PolarField,
+        count: int,
+        chip: Chip = LAMBERTIAN,
+        halves: tuple[bool, bool] = WHOLE,
+        aspect: float = 1.0,
+    ) -> list[PointGrid]:
         """About `count` rays of the centre of a chip, CHUNK at a time: small tensors stay in the cache of the processor.
 
-        halves: whether only those towards u > 0, and towards v > 0, whose power is of sum 1 then.
+        halves: whether only those towards u > 0, and towards v > 0, whose power is of sum 1 then; aspect: rays along u over those
+        along v.
         """
-        pairs, one = max(1, round(0.5 * math.sqrt(count * CORNERS))), torch.ones((), dtype=torch.float64)
-        cells = (torch.arange(2 * pairs, dtype=torch.float64) + 0.5) / (2 * pairs)
-        u, v = (cells[pairs:] if half else cells for half in halves)
+        one, points = torch.ones((), dtype=torch.float64), []
+        for half, share in zip(halves, (aspect, 1.0 / aspect), strict=True):
+            pairs = max(1, round(0.5 * math.sqrt(count * CORNERS * share)))
+            points.append((torch.arange(pairs if half else 0, 2 * pairs, dtype=torch.float64) + 0.5) / (2 * pairs))
+        u, v = points
         grids = [cls(field, Sample(some, v, True, one), chip) for some in u.split(max(1, CHUNK // len(v)))]
         total = sum(float(grid.power.sum()) for grid in grids)
         for grid in grids:
