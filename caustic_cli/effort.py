@@ -116,7 +116,7 @@ class Effort:
     )
     #: The same for two free-form surfaces, after the first of the stages above with one.
     two_stages: tuple[tuple[int, int, int, float], ...] = (
-        (800, 30_000, 150, 0.2),
+        (800, 20_000, 150, 0.2),
         (5_600, 60_000, 80, 0.03),
         (24_000, 600_000, 120, 0.006),
     )

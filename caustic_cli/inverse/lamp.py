@@ -158,7 +158,7 @@ class LampObjective:
         )
         self.pool = ThreadPoolExecutor(threads)
         self.through = partial(through_point if point else through, lamp, field)
-        apron, self.filter = FINER * APRON, NARROW if rays >= ENOUGH * target.numel() else WIDE
+        apron, self.filter = FINER * APRON, NARROW if point and rays >= ENOUGH * target.numel() else WIDE
         self.screen = Screen(goal.size, resolution=shape).grown((apron, apron))
         smooth = self.filter.smooth(torch.nn.functional.pad(target.double(), (apron,) * 4))
         self.inside = torch.nn.functional.pad(torch.ones_like(target), (apron,) * 4, value=float(point))
