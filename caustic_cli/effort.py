@@ -118,7 +118,7 @@ class Effort:
     two_stages: tuple[tuple[int, int, int, float], ...] = (
         (800, 20_000, 150, 0.2),
         (5_600, 60_000, 80, 0.03),
-        (24_000, 600_000, 120, 0.006),
+        (24_000, 600_000, 120, 0.012),
     )
     #: The same for a chip with an extent, whose rays cost more and whose blur hides what is smaller: instead of the last of either.
     chip_stages: tuple[tuple[int, int, int, float], ...] = ((3_100, 300_000, 90, 0.045),)
