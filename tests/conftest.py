@@ -123,6 +123,12 @@ LONG = (
 )
 
 
+@pytest.hookimpl(tryfirst=True)  # before fixtures of a module, whose figures depend on it
+def pytest_runtest_setup(item):
+    """One thread, also after a command that was given more."""
+    torch.set_num_threads(1)
+
+
 def pytest_collection_modifyitems(config, items):
     for item in items:
         if not config.getoption("--long") and any(name in item.nodeid for name in LONG):
