@@ -81,6 +81,14 @@ def test_faults_do_not(fault):
     assert not judged(picture(), fault(picture())).agree
 
 
+def test_even_light_which_correlates_with_nothing_agrees():
+    even, agreed = np.ones((60, 40)), 0
+    for seed in range(0, 200, 5):
+        renders = np.array([counts(even, seed + k, 16 * RAYS)[0] for k in range(4)])
+        agreed += verify.compare(renders, *counts(even, seed + 4), RAYS).agree
+    assert agreed >= 38
+
+
 def test_light_that_is_missing_is_noticed():
     image, squares = counts(picture(), 99)
     renders = np.array([counts(picture(), k, 16 * RAYS)[0] for k in range(4)])

@@ -52,8 +52,9 @@ LEAST_RAYS, JUDGED, MOST = 25, 0.8, 32
 NORMAL, CHI2, LARGEST = 0.0027, 0.05, 7.0
 #: Largest |Z| of the light on the screen, and fraction of it that single precision may lose between triangles and at borders.
 LIGHT, LEAK = 4.0, 5e-5
-#: Tolerance for a better correlation of a flipped image, which for symmetric pictures differs by noise alone.
-TIE = 1e-2
+#: Tolerance for a better correlation of a flipped image, which for symmetric pictures differs by noise alone; and standard errors
+#: of a correlation, of which that of an even picture consists.
+TIE, ERRORS = 1e-2, 4.0
 #: What is traced of a lens beyond a clear one.
 TRACED = ("mirror", "several wavelengths", "tilted screen", "shifted screen")
 VERIFICATION = Capability(
@@ -289,7 +290,7 @@ def compare(
         and beyond <= 2 * NORMAL + 3 * (NORMAL / len(some)) ** 0.5
         and largest < LARGEST
         and abs(light) < LIGHT
-        and own >= other - TIE
+        and own >= other - TIE - ERRORS * (1.0 - own * own) / image.size**0.5
     )
     return Agreement(render, image, np.repeat(np.repeat(z, side, 0), side, 1), figures)
 
