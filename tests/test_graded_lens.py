@@ -16,7 +16,7 @@ from PIL import Image
 
 from caustic_cli import cli, load
 from caustic_cli.inverse.constraints import Limits
-from caustic_cli.inverse.graded_lens import JointLoss, Start, design_graded_lens, initial_index
+from caustic_cli.inverse.graded_lens import FirstValues, JointLoss, design_graded_lens, initial_index
 from caustic_cli.inverse.gradient_index import IndexObjective, _LossOfLayers, volume
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.lbfgs import LBFGS
@@ -64,9 +64,9 @@ def objective(index: torch.Tensor, exit: HeightField | None = FIELD) -> IndexObj
     return IndexObjective(SCENE, target(), volume(SCENE, index), RAYS, 0, exit)
 
 
-def half() -> Start:
+def half() -> FirstValues:
     index = initial_index(SCENE, target(), (23, 25), RANGE, 64)
-    return Start(surface(Gradient("volume", volume=index.numpy())), index[:, :, None], bounds(), RANGE)
+    return FirstValues(surface(Gradient("volume", volume=index.numpy())), index[:, :, None], bounds(), RANGE)
 
 
 def run(capfd, *arguments: str, code: int = 0):
@@ -107,7 +107,7 @@ def test_equal_steps_of_the_blocks_change_the_image_alike():
 
 def test_with_the_index_frozen_it_is_the_design_of_a_surface():
     """In a lens of one index, traced by other code: the same surface after five iterations to 1e-8 mm."""
-    begun = Start(surface(), even(), bounds(), RANGE)
+    begun = FirstValues(surface(), even(), bounds(), RANGE)
     both = objective(begun.index)
     loss = JointLoss(both, begun, (1.0, 0.0))
     search = LBFGS(loss, torch.zeros(sum(loss.split), dtype=torch.float64))
@@ -134,7 +134,7 @@ def test_with_the_surface_frozen_it_is_the_design_of_an_index():
     one, other = both.evaluate({EXIT: flat, both.name: index}), plate.evaluate({plate.name: index})
     assert one.loss == pytest.approx(other.loss, rel=1e-12)
     assert torch.allclose(one.gradients[both.name], other.gradients[plate.name], rtol=1e-9, atol=1e-9 * one.loss)
-    loss = JointLoss(both, Start(flat, index, (flat - 1.0, flat + 1.0), RANGE), (0.0, 1.0), laplacian=True)
+    loss = JointLoss(both, FirstValues(flat, index, (flat - 1.0, flat + 1.0), RANGE), (0.0, 1.0), laplacian=True)
     loss.weights = (0.0, 1.0)  # in the unknowns of a plate
     alone, pixels = _LossOfLayers(plate, index, RANGE), plate.loss.target.numel()
 

@@ -41,12 +41,12 @@ from caustic_cli.scene import Scene
 
 #: Largest part of the deflection that the initial index takes.
 SHARE = 0.5
-#: Parts of a `Start` that the state of a search holds, since its unknowns count from there.
+#: Parts of a `FirstValues` that the state of a search holds, since its unknowns count from there.
 BEGUN = ("heights", "index")
 
 
 @dataclass(frozen=True, eq=False)
-class GradedLens:
+class IndexAndExit:
     """A gradient-index lens: its index, heights of the exit (n, m) mm, and the state from which the search continues bitwise."""
 
     index: SplineIndex
@@ -55,7 +55,7 @@ class GradedLens:
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class FirstValues:
     """Where a search begins."""
 
     #: Heights of the exit (n, m) mm, and control values of the index (n, m, layers).
@@ -90,7 +90,9 @@ class JointLoss:
         laplacian: the preconditioner, which a start by transport is better without.
     """
 
-    def __init__(self, objective: IndexObjective, start: Start, weights: tuple[float, float] = (1.0, 1.0), laplacian: bool = False):
+    def __init__(
+        self, objective: IndexObjective, start: FirstValues, weights: tuple[float, float] = (1.0, 1.0), laplacian: bool = False
+    ):
         self.objective, self.pixels = objective, objective.loss.target.numel()
         layers = [layer.contiguous() for layer in start.index.double().unbind(-1)]
         low, high = (torch.full_like(layers[0], limit) for limit in start.limits)
@@ -134,7 +136,7 @@ def design_graded_lens(
     scene: Scene,
     field: HeightField,
     target: np.ndarray,
-    start: Start,
+    start: FirstValues,
     *,
     rays: int,
     iterations: int,
@@ -144,7 +146,7 @@ def design_graded_lens(
     known: Mapping[str, Tensor] = MappingProxyType({}),
     on_iteration: Callable[[int, float, float, Tensor | None], None] = lambda k, loss, on_screen, image: None,
     stop: Callable[[], bool] = lambda: False,
-) -> GradedLens:
+) -> IndexAndExit:
     """Design index and exit for a picture.
 
     Args:
@@ -175,4 +177,4 @@ def design_graded_lens(
         on_iteration(k + 1, found.loss, found.on_screen, found.image)
     with torch.no_grad():
         heights, values = loss.lens(search.x)
-    return GradedLens(volume(scene, values), heights, search.state() | {name: getattr(start, name) for name in BEGUN})
+    return IndexAndExit(volume(scene, values), heights, search.state() | {name: getattr(start, name) for name in BEGUN})

@@ -20,7 +20,7 @@ from caustic_cli.config.default_stages import Table, refinement, transport_cells
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
-from caustic_cli.inverse.graded_lens import Start, design_graded_lens, initial_index
+from caustic_cli.inverse.graded_lens import FirstValues, design_graded_lens, initial_index
 from caustic_cli.inverse.gradient_index import design_gradient_index
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.kinds.defaults import Defaults
@@ -248,7 +248,7 @@ class GradedLens(IndexPlate):
             self._blank,
             self.field(0),
             self.target.numpy(),
-            Start(state.heights, first.contiguous(), self.bounds(0), lens.index_range),
+            FirstValues(state.heights, first.contiguous(), self.bounds(0), lens.index_range),
             rays=self.stages[-1].rays,
             iterations=iterations,
             seed=self.options.seed,
