@@ -28,7 +28,15 @@ import torch
 from torch import Tensor
 
 from caustic_cli.inverse.constraints import Limits
-from caustic_cli.inverse.gradient_index import INSIDE, IndexObjective, refuse_index_design, transport_index, volume
+from caustic_cli.inverse.gradient_index import (
+    INSIDE,
+    IndexObjective,
+    OnIteration,
+    iterate,
+    refuse_index_design,
+    transport_index,
+    volume,
+)
 from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Evaluation
@@ -144,7 +152,7 @@ def design_graded_lens(
     limits: Limits | None = None,
     how: LossImage | None = None,
     known: Mapping[str, Tensor] = MappingProxyType({}),
-    on_iteration: Callable[[int, float, float, Tensor | None], None] = lambda k, loss, on_screen, image: None,
+    on_iteration: OnIteration = lambda k, loss, on_screen, image: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> IndexAndExit:
     """Design index and exit for a picture.
@@ -168,13 +176,7 @@ def design_graded_lens(
     search = LBFGS(loss, torch.zeros(sum(loss.split), dtype=torch.float64))
     if known:
         search.load({name: value for name, value in known.items() if name not in BEGUN})
-    for k in range(iterations):
-        loss.evaluations.clear()
-        if stop() or not search.step():
-            break
-        assert search.f is not None
-        found = loss.evaluations[search.f]
-        on_iteration(k + 1, found.loss, found.on_screen, found.image)
+    iterate(search, loss.evaluations, iterations, on_iteration, stop)
     with torch.no_grad():
         heights, values = loss.lens(search.x)
     return IndexAndExit(volume(scene, values), heights, search.state() | {name: getattr(start, name) for name in BEGUN})

@@ -64,6 +64,8 @@ RAYS_A_PIXEL, OVERSAMPLE = 16, 2
 APRON = 0.04
 #: Relative margin of the initial index to the ends of its range.
 INSIDE = 0.01
+#: Called with the iteration, the loss, the fraction of the light on the screen and the image there.
+OnIteration = Callable[[int, float, float, Tensor | None], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,7 @@ def design_gradient_index(
     rays: int | None = None,
     seed: int = 0,
     begin: np.ndarray | None = None,
-    on_iteration: Callable[[int, float, float, Tensor | None], None] = lambda k, loss, on_screen, image: None,
+    on_iteration: OnIteration = lambda k, loss, on_screen, image: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> GradientIndexDesign:
     """Design the index field for a picture.
@@ -137,16 +139,30 @@ def design_gradient_index(
     loss = _LossOfLayers(objective, initial.coefficients, (low, high))
     search = LBFGS(loss, torch.zeros(layers * math.prod(control), dtype=torch.float64))
     history: list[tuple[float, float]] = []
+
+    def done(k: int, value: float, on_screen: float, image: Tensor | None) -> None:
+        history.append((value, on_screen))
+        on_iteration(k, value, on_screen, image)
+
+    iterate(search, loss.evaluations, iterations, done, stop)
+    with torch.no_grad():
+        return GradientIndexDesign(volume(scene, loss.values(search.x)), initial, tuple(history))
+
+
+def iterate(
+    search: LBFGS, evaluations: dict[float, Evaluation], iterations: int, on_iteration: OnIteration, stop: Callable[[], bool]
+) -> None:
+    """At most so many iterations of a search, until it finds no progress or `stop` says so before one.
+
+    evaluations: by their values, filled by the function that is minimised.
+    """
     for k in range(iterations):
-        loss.evaluations.clear()
+        evaluations.clear()
         if stop() or not search.step():
             break
         assert search.f is not None
-        result = loss.evaluations[search.f]
-        history.append((search.f, result.on_screen))
-        on_iteration(k + 1, search.f, result.on_screen, result.image)
-    with torch.no_grad():
-        return GradientIndexDesign(volume(scene, loss.values(search.x)), initial, tuple(history))
+        found = evaluations[search.f]
+        on_iteration(k + 1, found.loss, found.on_screen, found.image)
 
 
 class _LossOfLayers:

@@ -21,7 +21,7 @@ from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.graded_lens import FirstValues, design_graded_lens, initial_index
-from caustic_cli.inverse.gradient_index import design_gradient_index
+from caustic_cli.inverse.gradient_index import OnIteration, design_gradient_index
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.surface import Described, OneSurface
@@ -33,8 +33,6 @@ from caustic_cli.schema.table import LensSettings, ScreenSettings, check, check_
 
 manufacture = OnDemand("caustic_cli.studies.manufacture")
 
-#: Called with the iteration, the loss, the fraction of the light on the screen and the image there.
-OnIteration = Callable[[int, float, float, Tensor | None], None]
 #: Half range about the index; degree of its splines, knot spans per pixel and their largest number.
 HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS = 0.05, 3, 2, 768
 RAYS_BENT, ITERATIONS = 16, 24  # largest number of rays per pixel, since they cost more; and iterations
