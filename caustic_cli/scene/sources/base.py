@@ -143,6 +143,11 @@ class Source:
         return self.in_turn
 
     @property
+    def behind_each(self) -> bool:
+        """Whether they stand behind their lenslets and shine at once."""
+        return self.by_lenslet and not self.in_turn
+
+    @property
     def half_angle(self) -> float:
         """Largest angle of a distant source's rays to its axis."""
         return 0.0

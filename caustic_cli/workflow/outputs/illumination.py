@@ -97,7 +97,7 @@ def _images(rendering: Rendering) -> Iterator[tuple[float, np.ndarray]]:
     """Of each lenslet's source, its share of the light and the image of this light (n_x, n_y): of a beam through the lenslet alone,
     of a source behind it through the whole array."""
     lens, scene = rendering.lens, rendering.plan.scene
-    if scene.source.by_lenslet and not scene.source.in_turn:
+    if scene.source.behind_each:
         whole = zip(scene.by_source, scene.source.fractions, strict=True)
         parts = [(one, lens.field, lens.heights, share) for one, share in whole]
     else:

@@ -16,7 +16,7 @@ class Stray(Output):
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """stray: on_lens and on_screen, of the light there; none if no light is on the screen."""
         lens, plan, total = rendering.lens, rendering.plan, float(rendering.image.sum())
-        if not plan.scene.source.by_lenslet or plan.scene.source.in_turn or not total > 0:
+        if not plan.scene.source.behind_each or not total > 0:
             return {}
         with rendering.say.notify_if_slow("tracing the light of every source through the lenslets of others"):
             fallen, seen = study.stray_light(
