@@ -65,8 +65,8 @@ EXCLUDED: dict[str, dict[str, str]] = {
     "source.each": {"source.also": "⟨source.each⟩ needs one [[source]], of which there is one behind every lenslet"},
     "source.tilt": {
         **dict.fromkeys(
-            (*TRAITS["two sides"].settings, "lens.gradient free", "element", "design.over"),
-            "⟨source.tilt⟩ is for a lens with a flat entrance, an array of lenslets or a mirror, without ⟨{path}⟩",
+            ("lens.gradient free", "element", "design.over"),
+            "⟨source.tilt⟩ cannot be combined with ⟨{path}⟩, whose light is along the axis",
         ),
         "design.robust": "⟨source.tilt⟩ cannot be combined with ⟨design.robust⟩, whose errors are those of light along the axis",
     },

@@ -110,7 +110,7 @@ def lit_by_sun(room: RoomSettings | None, by: Parameters) -> RoomSettings | None
 
 def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping[str, Any]) -> ScreenSettings:
     """The screen in its place in the room; without one, square to light that is tilted and centred on it, where its own tilt and
-    shift are not given.
+    shift are not given.  Two free-form sides turn the light onto the axis instead: the screen stands as without tilt.
 
     room, given: the sections [room] and [screen] as given.
 
@@ -119,7 +119,7 @@ def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping
     """
     interaction, source = interaction_of(s.lens.mirror), build_source(s.source)
     if by.screen_place is None or s.screen.far:
-        if not source.lean:
+        if not source.lean or s.second is not None:
             return s.screen
         x, y, z = (abs(s.screen.z) / source.axis[2] * c for c in source.axis)
         return s.screen.filled(tilt=[interaction.side * angle + 0.0 for angle in source.tilt], shift=[x + 0.0, y + 0.0])

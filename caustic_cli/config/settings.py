@@ -24,7 +24,7 @@ from caustic_cli.errors import InputError, alternatives, near
 from caustic_cli.io.files import read_bytes
 from caustic_cli.loading import OnDemand
 from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
-from caustic_cli.scene.aperture import Aperture, Pupil
+from caustic_cli.scene.aperture import Aperture, Pupil, larger
 from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.lens import lenslet_centres
 from caustic_cli.scene.materials import refractive_index
@@ -508,7 +508,8 @@ def build_second(settings: Settings) -> SecondTarget | None:
     if "file" in s:
         screen = build_screen(settings.screen)
         margin = [a / b for a, b in zip(screen.size, settings.target.size, strict=True)]
-        return SecondTarget(Screen((margin[0] * s.size[0], margin[1] * s.size[1]), s.z, screen.resolution))
+        size, farther = (margin[0] * s.size[0], margin[1] * s.size[1]), s.z / screen.z
+        return SecondTarget(Screen(size, s.z, screen.resolution, screen.tilt, larger(screen.shift, farther)))
     if "focus" in s:
         return SecondTarget(focus=s["focus"])
     return SecondTarget() if s.collimate else None

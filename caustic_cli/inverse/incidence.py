@@ -74,11 +74,11 @@ def is_traced(scene: Scene) -> bool:
     return bool(scene.in_front) or medium_of(scene.lens).varies
 
 
-def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, tuple | None]:
-    """The same in air on the plane of the entrance."""
+def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray | None = None) -> tuple[np.ndarray, tuple | None]:
+    """The same in air at heights z of the entrance, mm; None for its plane."""
     bare = {"index": 1.0 + 1e-9, "glass": None, "gradient": None, "fresnel": "none", "entrance": None}
     air = replace(scene, lens=replace(scene.lens, **bare), second_target=None)
-    return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
+    return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in) if z is None else z)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,10 @@
 
 Notation
     u       a point of the entrance plane;  e of the exit;  p of the screen, where the picture is
-    q       the landing point of the light of p on a second screen, or a common focus
+    q       the landing point of the light of p on a second screen, parallel to the first, or a common focus
     d, t    unit directions of light inside the glass and behind the lens
+
+Screens may be tilted: p and q are points in space, which pictures pair in their own coordinates.
 
 Two pictures determine the map p -> q: to first order in the angles the rays of one wavefront follow the gradient of a convex
 function, and exactly one such map transports one picture to the other (Brenier 1991).  Collimated or focused light determines it
@@ -33,6 +35,7 @@ from caustic_cli.inverse.scattered import Pixels
 from caustic_cli.inverse.surface_from_map import slopes_to, surface
 from caustic_cli.inverse.surface_from_slopes import fitted
 from caustic_cli.inverse.transport import cell_lines, corners, solve
+from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.scene.screen import Sags
@@ -55,19 +58,29 @@ BESIDE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class PlanePicture:
-    """A picture on a plane: irradiance (k, l), half sizes, mm, z of the plane and centre of the picture there, mm."""
+class Picture:
+    """A picture on a screen: irradiance (k, l), half sizes and centre of it in the screen's own coordinates, mm."""
 
     light: np.ndarray
+    screen: Screen
     half: tuple[float, float]
-    z: float
     centre: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def on(cls, screen: Screen, light: np.ndarray) -> Picture:
+        """One that fills its screen."""
+        return cls(light, screen, screen.half_size)
 
     @property
     def corners(self) -> list[np.ndarray]:
-        """Coordinates of the corners of its pixels, (k + 1, l + 1) each, mm."""
+        """Own coordinates of the corners of its pixels, (k + 1, l + 1) each, mm."""
         lines = (c + corners(n, h) for n, h, c in zip(self.light.shape, self.half, self.centre, strict=True))
         return np.meshgrid(*lines, indexing="ij")
+
+    @property
+    def points(self) -> np.ndarray:
+        """These corners in space, (3, k + 1, l + 1) mm."""
+        return np.stack(points_in_space(self.screen, *self.corners))
 
     @property
     def lit(self) -> np.ndarray:
@@ -133,24 +146,26 @@ def first_sides(
         most, max(least, A_PIXEL * max(target.shape), *(n - p for n, p in zip(field.shape, scene.lens.degree, strict=True)))
     )
     levels = [_level(scene, field, cells, COARSER)] * (REPEATS - 1) + [_level(scene, field, cells, 1)]
-    near = PlanePicture(target, scene.screen.half_size, scene.screen.z, scene.screen.shift)
+    near = Picture.on(scene.screen, target)
     if second is not None and behind.screen is not None:
-        slopes = slopes_behind(near, PlanePicture(second, behind.screen.half_size, behind.screen.z, behind.screen.shift))
+        slopes = slopes_behind(near, Picture.on(behind.screen, second))
     else:
         slopes = slopes_towards(near, behind.focus)
-    (px, py), lit = near.corners, near.lit
+    points, lit = near.points, near.lit
+    px, py, pz = points
     flat = [torch.full(levels[0].field.shape, z, dtype=torch.float64) for z in (0.0, thickness)]
     level, nets = levels[0], torch.stack(flat)
     for k, now in enumerate(levels):
-        grid, exit = now.grid, now.grid.heights(level.field, nets[1])
+        grid = now.grid
+        front, exit = (grid.heights(level.field, net) for net in nets)
         at = np.full(px.shape, thickness)
         for _ in range(HEIGHTS if k else 1):  # the first step is exact for a flat exit
-            ex, ey = px - slopes[0] * (near.z - at), py - slopes[1] * (near.z - at)
+            ex, ey = px - slopes[0] * (pz - at), py - slopes[1] * (pz - at)
             at = grid.at(exit, ex, ey)
         on_exit = _on_exit(near.light, ex, ey, grid)
-        aim = interpolate_scattered(np.stack([ex[lit], ey[lit]]), np.stack([px[lit], py[lit]]), *grid.corners)
+        aim = interpolate_scattered(np.stack([ex[lit], ey[lit]]), points[:, lit], *grid.corners)
         pixels = near.pixels(ex, ey) if k else None
-        entrance = net_of(grid.x, grid.y, _entrance(scene, now, on_exit, exit, pixels), now.field)
+        entrance = net_of(grid.x, grid.y, _entrance(scene, grid, front, on_exit, exit, pixels), now.field)
         level, nets = now, torch.stack([entrance, net_of(grid.x, grid.y, exit, now.field)])
         for _ in range(1 if k else FIRST_FITS):
             nets[1] = _exit(scene, level.field, nets, grid, aim)
@@ -159,13 +174,10 @@ def first_sides(
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """Cells and spline spaces of both surfaces at a resolution, and the light of the source on the entrance's plane, see
-    `on_entrance`."""
+    """Cells and spline spaces of both surfaces at a resolution."""
 
     grid: _CellGrid
     field: HeightField
-    light: np.ndarray
-    directions: tuple | None
 
 
 def _level(scene: Scene, field: HeightField, cells: int, coarser: int) -> _Level:
@@ -174,57 +186,64 @@ def _level(scene: Scene, field: HeightField, cells: int, coarser: int) -> _Level
     if coarser > 1 and lens.knots is None:
         control = [max(p + 1, -(-(n - p) // coarser) + p) for n, p in zip(field.shape, lens.degree, strict=True)]
         field = HeightField.of(replace(lens, control=(control[0], control[1])))
-    grid = _CellGrid.of(lens.half_size, -(-cells // coarser))
-    return _Level(grid, field, *on_entrance(scene, grid.x, grid.y))
+    return _Level(_CellGrid.of(lens.half_size, -(-cells // coarser)), field)
 
 
-def slopes_behind(near: PlanePicture, far: PlanePicture) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes (dx/dz, dy/dz) of the rays from the pixel corners of the near picture to the far one, by optimal transport."""
+def slopes_behind(near: Picture, far: Picture) -> np.ndarray:
+    """Slopes (dx/dz, dy/dz) of the rays from the pixel corners of the near picture to the far one, (2, k + 1, l + 1), by optimal
+    transport."""
     small = [_resampled(p) for p in (near, far)]
     if np.count_nonzero(small[0].light) * small[1].light.size > np.count_nonzero(small[1].light) * small[0].light.size:
         found = solve(small[0].light, small[1].light, small[0].half, small[1].half, darkest=DARKEST)
-        at, lands = small[0].corners, (found.x + small[1].centre[0], found.y + small[1].centre[1])
+        at, lands = small[0].corners, [found.x + small[1].centre[0], found.y + small[1].centre[1]]
         lit = small[0].lit
     else:  # from the picture with fewer black pixels, for which the transport converges faster
         found = solve(small[1].light, small[0].light, small[1].half, small[0].half, darkest=DARKEST)
         at, lands = [found.x + small[0].centre[0], found.y + small[0].centre[1]], small[1].corners
         lit = small[1].lit
-    x, y = near.corners
-    qx, qy = interpolate_scattered(np.stack([c[lit] for c in at]), np.stack([c[lit] for c in lands]), x, y)
-    far_off = far.z - near.z
-    return (qx - x) / far_off, (qy - y) / far_off
+    found = interpolate_scattered(np.stack([c[lit] for c in at]), np.stack([c[lit] for c in lands]), *near.corners)
+    return _slopes(np.stack(points_in_space(far.screen, *found)) - near.points)
 
 
-def slopes_towards(near: PlanePicture, focus: tuple[float, float, float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The same for light that leaves the picture along z, or towards a focus behind it, mm."""
-    x, y = near.corners
+def slopes_towards(near: Picture, focus: tuple[float, float, float] | None) -> np.ndarray:
+    """The same for light that leaves the picture along the normal of its screen, or towards a focus behind it, mm."""
+    points = near.points
     if focus is None:
-        return np.zeros_like(x), np.zeros_like(y)
-    return (focus[0] - x) / (focus[2] - near.z), (focus[1] - y) / (focus[2] - near.z)
+        return _slopes(np.broadcast_to(np.reshape(near.screen.axes[2], (3, 1, 1)), points.shape))
+    return _slopes(np.reshape(focus, (3, 1, 1)) - points)
 
 
-def _entrance(scene: Scene, level: _Level, on_exit: np.ndarray, exit: np.ndarray, pixels: Pixels | None) -> np.ndarray:
+def _slopes(ahead: np.ndarray) -> np.ndarray:
+    """Slopes (2, ...) of directions (3, ...) of any length."""
+    return ahead[:2] / ahead[2]
+
+
+def _entrance(
+    scene: Scene, grid: _CellGrid, front: np.ndarray, on_exit: np.ndarray, exit: np.ndarray, pixels: Pixels | None
+) -> np.ndarray:
     """Heights of the entrance at the corners of the cells, from its plane, mm, for an irradiance on the exit.
 
     Args:
+        front: approximate ones, where the light of the source meets them, see `on_entrance`.
         on_exit: irradiance on the cells there, any unit; exit: heights of the exit at their corners, mm.
         pixels: of the picture, where their light leaves the exit; None for a flat exit.
     """
     lens = scene.lens
+    light, directions = on_entrance(scene, grid.x, grid.y, lens.z_in + front)
     z, half, centre, projection = lens.offset.thickness, lens.half_size, (0.0, 0.0), None
     if pixels is not None and (to := pixels.project):
         projection = seen = ScreenProjection(Screen(lens.size, z, on_exit.shape, sags=Sags(exit - z, lens.size)), lens.z_in)
         on_exit, half, centre = seen.projected_target(on_exit)
         pixels = replace(pixels, project=lambda x, y: seen.project(*to(x, y)), centre=centre)
     found = surface(
-        level.light,
+        light,
         on_exit,
         lens.half_size,
         half,
         1.0 / lens.index,
         z,
         lens.z_in,
-        level.directions,
+        directions,
         corrections=1,
         centre=centre,
         projection=projection,
@@ -237,12 +256,12 @@ def _exit(scene: Scene, field: HeightField, nets: Tensor, grid: _CellGrid, aim: 
     """The control net (n, m), mm, of an exit that deflects the rays from the entrance towards points on the screen.
 
     Args:
-        nets: of both surfaces, (2, n, m) mm; aim: target points of the rays from the corners of the cells, (2, ...) mm.
+        nets: of both surfaces, (2, n, m) mm; aim: target points of the rays from the corners of the cells, (3, ...) mm.
     """
     light = internal_rays(scene, field, nets, RAYS_A_CONTROL * nets[1].numel())
     x, y, z = light.exit
-    px, py = (grid.at(a, x, y) for a in aim)
-    slopes = slopes_to(px - x, py - y, scene.screen.z - z, light.direction, scene.lens.index)
+    px, py, pz = (grid.at(a, x, y) for a in aim)
+    slopes = slopes_to(px - x, py - y, pz - z, light.direction, scene.lens.index)
     at, asked = ((torch.from_numpy(a), torch.from_numpy(b)) for a, b in ((x, y), slopes))
     return fitted(field, at, asked, torch.from_numpy(light.power), nets[1])
 
@@ -275,7 +294,7 @@ def _on_exit(light: np.ndarray, ex: np.ndarray, ey: np.ndarray, grid: _CellGrid)
     return gaussian_filter(total, SMOOTH)
 
 
-def _resampled(picture: PlanePicture) -> PlanePicture:
+def _resampled(picture: Picture) -> Picture:
     """The picture resampled to about PAIRED cells along each axis: pixels subdivided or binned, zero-padded at the high edges."""
     light = picture.light
     cut = [min(CUT, max(1, round(PAIRED / n))) for n in light.shape]
@@ -286,4 +305,4 @@ def _resampled(picture: PlanePicture) -> PlanePicture:
     light = light.reshape(light.shape[0] // by[0], by[0], light.shape[1] // by[1], by[1]).sum((1, 3))
     half = picture.half[0] * grown[0], picture.half[1] * grown[1]
     x, y = (c + g - h for c, g, h in zip(picture.centre, half, picture.half, strict=True))
-    return PlanePicture(light, half, picture.z, (x, y))
+    return Picture(light, picture.screen, half, (x, y))

@@ -79,7 +79,8 @@ def complete(
         s = s.changed(source=at, design=complete_network(s.design))
     if over or relative_to_initial(s.design):
         s = s.changed(design=s.design if "initial" in given.get("design", {}) else s.design.changed(initial="zero-last"))
-    s = s.changed(second=complete_second(s), screen=stand(s, by, room, given.get("screen", {})))
+    s = s.changed(second=complete_second(s))
+    s = s.changed(screen=stand(s, by, room, given.get("screen", {})))
     s = s.changed(target=complete_target(s, by, aspect))
     s = s.changed(screen=complete_screen(s.screen, s.target, by))
     s = s.changed(second=complete_second_size(s))

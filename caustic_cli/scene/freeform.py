@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import mul
 
 import numpy as np
 
@@ -57,11 +58,18 @@ class SecondTarget:
         """Check that the target lies behind the first picture's screen.
 
         Raises:
-            InputError: it does not, or that screen is tilted or curved.
+            InputError: it does not, or that screen is the far field.
         """
-        if not screen.upright:
-            raise InputError("the screen of a lens with two free-form sides must be plane and upright, without ⟨screen.tilt⟩")
-        z = self.screen.z if self.screen is not None else self.focus[2] if self.focus is not None else None
-        if z is not None and z <= screen.z:
+        if screen.far:
+            raise InputError(
+                f"⟨{self.setting}⟩ says what light does behind the picture, and nothing is behind the far field: it needs a screen"
+                " at a distance"
+            )
+        place = self.screen.centre if self.screen is not None else self.focus
+        if place is None:
+            return
+        away = [a - b for a, b in zip(place, screen.centre, strict=True)]
+        normal = screen.axes[2]
+        if not sum(map(mul, away, normal)) * normal[2] > 0:
             name = "z" if self.screen is not None else "focus"
-            raise InputError(f"⟨second.{name}⟩ must lie behind the picture's screen at {screen.z:g} mm, got z = {z:g} mm")
+            raise InputError(f"⟨second.{name}⟩ must lie behind the picture's screen at {screen.z:g} mm, got z = {place[2]:g} mm")

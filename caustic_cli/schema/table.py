@@ -456,7 +456,7 @@ class SecondSettings(Section):
     z: float = setting("distance of that screen from the lens' origin", "mm", *DISTANCE, option=Option("--second-at", "MM"))
     size: Pair = setting("width and height of that picture", "mm", *SCREEN, derived="that of a beam from the lens' edge through"
             " that of the first picture", option=Option("--second-size", "W[xH]"))
-    collimate: bool = setting("collimate the light behind the picture, parallel to the axis", default=False, written=False,
+    collimate: bool = setting("collimate the light behind the picture, square to its screen", default=False, written=False,
             option=Option("--collimate"))
     focus: Point | None = setting("focus of the light behind the picture", "mm", *DISTANCE, option=Option("--focus", "X,Y,Z"))
 
