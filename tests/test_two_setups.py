@@ -7,16 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sequential
 import torch
 from helpers import write_blob
+from scipy.interpolate import RectBivariateSpline
 from test_machine import at, spline
 
 from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.export.heightmap import write_heightmap
+from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.milling.gcode import write_gcode
-from caustic_cli.export.register import sides_of, with_stock
+from caustic_cli.export.part import Part
+from caustic_cli.export.points import write_csv
+from caustic_cli.export.register import between_backs, parts_of, registered, sides_of, with_stock
+from caustic_cli.export.zemax import write_zemax
 from caustic_cli.io.gcode import read_program
 from caustic_cli.io.heightmaps import beside, read_heightmap
 from caustic_cli.optics.envelope import Envelope
@@ -127,3 +133,93 @@ def test_the_commands_write_both_sides(tmp_path, monkeypatch, capfd):
     stock = read_program("p.nc").top
     thick = surface("p.nc", x, 0.5 * x) + surface("p-entrance.nc", x, -0.5 * x) - stock
     assert (np.diff(thick) != 0).all() and (thick > 0.0).all()
+
+
+def test_the_halves_of_a_mould_enclose_the_lens(tmp_path, lens):
+    """Closed on a frame between their faces: the lower half as it lies, the upper one turned over, both on the same pins."""
+    m = Milling(scallop=0.002)
+    halves = parts_of("gcode", *lens[:3], m, mould=True)
+    paths = (tmp_path / "a.nc", tmp_path / "a-entrance.nc")
+    for path, half in zip(paths, halves, strict=True):
+        write_gcode(path, half, with_stock(m, half))
+    upper, lower = (read_program(path) for path in paths)
+    frame = halves[0].register.frame
+    x, y = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 4000)) * [[4.9], [3.9]]
+    below = surface(paths[1], x, y)  # above the back of the lower half
+    above = lower.top + frame + (upper.top - surface(paths[0], x, -y))
+    less = at(lens[1], lens[2], x, y) - at(lens[3], lens[4], x, y) - (above - below)  # what the balls leave is not glass
+    assert less.min() > -1e-4 and 0.002 < less.max() < 2 * 0.00205
+    assert registered(halves)["register"]["between_backs_mm"] == pytest.approx(lower.top + frame + upper.top)
+    holes = [{tuple(p) for p in program.cuts[0].tips[~program.cuts[0].rapid][:, :2].tolist()} for program in (upper, lower)]
+    assert holes[0] == holes[1] and len(holes[0]) == 2 and all("pins" in path.read_text() for path in paths)
+
+
+def test_solid_halves_fill_their_block_with_the_lens(lens):
+    """Of meshes: closed, outward, and with volumes that add up to the aperture times the distance of the backs."""
+    scene, field, heights = lens[:3]
+    halves = parts_of("stl", scene, field, heights, Milling(), mould=True, block=1.5)
+    turned_over = halves[0].turned, halves[1].turned
+    assert turned_over == (True, False) and [half.register for half in halves] == [None, None]
+    volumes = []
+    for part in (*halves, Part(scene, field, heights, "lens")):
+        vertices, faces = closed_mesh(part.scene, part.field, torch.as_tensor(part.heights), (41, 37))
+        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        assert {tuple(e) for e in edges.tolist()} == {tuple(e[::-1]) for e in edges.tolist()}
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        volumes.append(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+    assert min(volumes) > 0 and sum(volumes) == pytest.approx(80.0 * between_backs(halves), rel=1e-4)
+    low = min(float((-half.heights if half.turned else half.heights).min()) for half in halves[1:])
+    assert low - halves[1].lens.z_in == pytest.approx(1.5)
+
+
+def test_sides_that_reach_past_each_other_have_no_faces_between_them(lens):
+    scene, field, heights = lens[:3]
+    x = field.control_xy()[0]
+    tilted = heights + 1.5 * x[:, None]
+    with pytest.raises(InputError, match="reach past each other"):
+        parts_of("gcode", scene, field, tilted, Milling(), mould=True)
+    assert len(parts_of("step", scene, field, tilted, Milling(), mould=True)) == 2
+
+
+def read_zemax(path):
+    """x, y, z - vertex (nx, ny) of a Grid Sag file, and the numbers of its comment on the vertex."""
+    lines = path.read_text().splitlines()
+    head, rows = [one for one in lines if one.startswith("!")], [one for one in lines if one and not one.startswith("!")]
+    nx, ny, dx, dy, *_ = map(float, rows[0].split())
+    z = np.array([float(row.split()[0]) for row in rows[1:]]).reshape(int(ny), int(nx))[::-1].T
+    x, y = ((np.arange(n) - 0.5 * (n - 1)) * d for n, d in ((nx, dx), (ny, dy)))
+    (said,) = (one for one in head if "vertex" in one)
+    return x, y, z, [float(n) for n in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?(?= mm| *,)", said)]
+
+
+def read_csv(path):
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    x, y = np.unique(table[:, 0]), np.unique(table[:, 1])
+    return x, y, table[:, 2].reshape(len(y), len(x)).T
+
+
+@pytest.mark.parametrize("format", ["csv", "zemax"])
+def test_both_sides_are_read_from_files_of_one_surface_each(tmp_path, lens, format):
+    """And light goes where it does through the lens, by a tracer and splines of others."""
+    scene, field, heights = lens[:3]
+    sides, paths = parts_of(format, scene, field, heights, Milling()), [tmp_path / "a", tmp_path / "a-entrance"]
+    writer = {"csv": write_csv, "zemax": write_zemax}[format]
+    for path, side in zip(paths, sides, strict=True):
+        writer(path, side.scene, side.field, side.heights, 4)
+    if format == "csv":
+        read = [RectBivariateSpline(*read_csv(path)) for path in paths]
+    else:
+        (*exit, said), (*front, back) = (read_zemax(path) for path in paths)
+        middle = float(at(lens[3], lens[4], np.zeros(1), np.zeros(1))[0])
+        assert back[0] == pytest.approx(0.0, abs=1e-12)
+        read = [RectBivariateSpline(a, b, z + up) for (a, b, z), up in ((exit, middle + said[0]), (front, middle))]
+    own = [lambda x, y, s=s: at(*s, x, y) for s in ((field, heights), (lens[3], lens[4]))]
+    rng, n = np.random.default_rng(2), scene.lens.index
+    start = np.stack([*rng.uniform(-3.5, 3.5, (2, 300)), np.full(300, -5.0)], 1)
+    ahead = np.tile([0.05, -0.03, np.sqrt(1 - 0.05**2 - 0.03**2)], (300, 1))
+    found = []
+    for exit_side, entrance in (read, own):
+        faces = ((getattr(s, "ev", s), (0, 0, 0), (0, 0), *indices) for s, indices in ((entrance, (1.0, n)), (exit_side, (n, 1.0))))
+        o, d, _ = sequential.walk(start, ahead, faces)
+        found.append(sequential.onto(o, d, (0.0, 0.0, 300.0)))
+    assert np.abs(found[0] - found[1]).max() < 5e-4  # of roundings of heights, on a screen 300 mm away

@@ -247,13 +247,15 @@ def _given(asked: ExportOptions, formats: list[str]) -> dict[str, Any]:
 
 
 def _register_words(register: dict[str, Any]) -> str:
-    """The register of both sides of a lens in a line."""
+    """The register of both sides of a lens, or of the halves of its mould, in a line."""
+    apart = f"backs {register['between_backs_mm']:.6g} mm apart" if "between_backs_mm" in register else ""
+    if "pins_mm" not in register:
+        return f"the halves of the mould are closed with their {apart}"
     wide, high, thick = register["stock_mm"]
-    pins = " and ".join(f"{x:g}" for x, _ in register["pins_mm"])
-    return (
-        f"both sides in a stock of {wide:.4g} x {high:.4g} x {thick:g} mm, turned over about x on pins of"
-        f" {register['pin_diameter_mm']:g} mm at x = {pins}, y = 0"
-    )
+    pins = f"pins of {register['pin_diameter_mm']:g} mm at x = {' and '.join(f'{x:g}' for x, _ in register['pins_mm'])}, y = 0"
+    if apart:
+        return f"the halves of the mould on {pins}, with a frame of {register['frame_mm']:.6g} mm between their faces: {apart}"
+    return f"both sides in a stock of {wide:.4g} x {high:.4g} x {thick:g} mm, turned over about x on {pins}"
 
 
 def _printer(text: str) -> tuple[float, float]:

@@ -15,6 +15,7 @@ programs are in the orientation of machining.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -32,10 +33,10 @@ BLOCK = 0.2
 
 @dataclass(frozen=True)
 class Register:
-    """How both sides of a part lie in its stock, see `export.register`.
+    """How both sides of a part lie in its stock, or the halves of its mould on their pins, see `export.register`.
 
     thickness: of the stock; wide, high: of the stock along X and Y; pins: X of their middles, at Y0; pin: their diameter; rim:
-    least thickness of the lens at its edge; all mm.
+    least thickness of the lens at its edge, inf for a mould; frame: of a mould, what separates the faces of its halves; all mm.
     """
 
     thickness: float
@@ -43,7 +44,8 @@ class Register:
     high: float
     pins: tuple[float, float]
     pin: float
-    rim: float
+    rim: float = math.inf
+    frame: float | None = None
 
     @property
     def figures(self) -> dict:
@@ -52,12 +54,21 @@ class Register:
             "stock_mm": [self.wide, self.high, self.thickness],
             "pins_mm": [[x, 0.0] for x in self.pins],
             "pin_diameter_mm": self.pin,
-            "turned_over_about": "x",
+            **({"turned_over_about": "x"} if self.frame is None else {"frame_mm": self.frame}),
         }
+
+    def drills(self, turned: bool) -> bool:
+        """Whether the program of a side, turned or not, drills the holes: the first of a lens, and those of both halves."""
+        return self.frame is not None or not turned
 
     def said(self, second: bool) -> list[str]:
         """Comments of a program for a side."""
         where = " and ".join(f"X{x:g} Y0" for x in self.pins)
+        if self.frame is not None:
+            return [
+                f"(register: dowel pins of {self.pin:g} mm at {where} through both halves)",
+                f"(frame: {self.frame:.6g} mm between the faces of the halves, with the outline of the lens for its window)",
+            ]
         side = (
             "second, the first one on the table: fill it with wax or pitch; the stock is on the pins"
             if second

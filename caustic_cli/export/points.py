@@ -1,4 +1,4 @@
-"""Writer of the points of the exit surface, x varying fastest, both ascending: `.csv` with a header, or plain `.xyz`.
+"""Writer of the points of a surface, x varying fastest, both ascending: `.csv` with a header, or plain `.xyz`.
 
     x_mm,y_mm,z_mm          # created by caustic ...
     -5,-5,5.1               -5 -5 5.1

@@ -1,9 +1,13 @@
-"""Both sides of a lens with two free-form ones, each in the coordinates of its setup, and the register between them.
+"""Both sides of a lens with two free-form ones, or both halves of its mould, and the register between them.
 
 The lens stays in its stock, a plate with two dowel holes beside the lens, which is turned over between the setups about the line
 through them, the x axis: (x, y, z) -> (x, -y, -z).  X0 Y0 is the middle of the lens in both, Z0 the face of the stock that lies on
 the table, so that the same pins stand at the same X and Y, and the thickness of the stock, which has to be as stated, is the datum
 between the sides.  The holes are unequally far from the middle: the stock does not fit the other way round.
+
+The halves of a mould are blocks with the negative of the entrance, as it lies, and of the exit, turned over.  They have flat
+backs, whose distance says how far apart they are.  Where they are machined, both are drilled for the same pins, and their faces,
+which are flat beside the lens, are held apart by a frame that has the outline of the lens for its window.
 
 Notation
     H       thickness of the stock, mm;  b  z of its lower face, so that Z = z - b for the exit and Z = b + H - z for the entrance
@@ -12,6 +16,7 @@ Notation
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +24,12 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.export import AS_CUT, SIDE_BY_SIDE
 from caustic_cli.export.milling import FACING, Milling
-from caustic_cli.export.part import Part, Register, alone, turned
+from caustic_cli.export.part import BLOCK, Part, Register, alone, part_of, turned
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.scene import Aperture, Scene
+from caustic_cli.scene import Aperture, Lens, Scene
 
 #: Points along the edge of the lens at which its thickness is compared.
 EDGE = 721
@@ -32,6 +38,28 @@ EDGE = 721
 def other(path: Path) -> Path:
     """Name of the entrance's file beside that of the exit."""
     return path.with_name(f"{path.stem}-entrance{path.suffix}")
+
+
+def parts_of(
+    format: str, scene: Scene, field: HeightField, heights: Tensor, m: Milling, mould: bool = False, block: float | None = None
+) -> tuple[Part, ...]:
+    """The parts that a format holds, each in a file: one, or the sides of a lens with two free-form ones, the exit first.
+
+    Args:
+        m: see `sides_of`; mould, block: as of `part_of`.
+
+    Raises:
+        InputError: as of `part_of` and `sides_of`.
+    """
+    one = part_of(format, scene, field, heights, mould, block)  # which refuses what contradicts the format
+    if scene.lens.entrance is None or not (mould or format in SIDE_BY_SIDE):
+        return (one,)
+    if mould:
+        return halves_of(one, scene, m if format in AS_CUT else None, block)
+    if format in AS_CUT:
+        return sides_of(scene, field, heights, m)
+    front = entrance_of(scene.lens)
+    return replace(one, kind="lens, exit side"), Part(scene, front.field, front.heights + scene.lens.z_in, "lens, entrance side")
 
 
 def sides_of(scene: Scene, field: HeightField, heights: Tensor, m: Milling) -> tuple[Part, Part]:
@@ -51,14 +79,59 @@ def sides_of(scene: Scene, field: HeightField, heights: Tensor, m: Milling) -> t
     if thickness < high - low:
         raise InputError(f"⟨stock⟩ must be as thick as the lens, {high - low:.6g} mm, got {thickness:g} mm")
     base = low - 0.5 * (thickness - (high - low))
-    beside = 2.0 * max(m.tool_radius, m.rough_radius) + m.pin
-    near = math.ceil(10.0 * (lens.opening.reach + beside)) / 10.0
-    far = near + 2.0 * m.pin
-    size = 2.0 * far + 4.0 * m.pin, lens.size[1] + 2.0 * beside
-    register = Register(thickness, *size, (near, -far), m.pin, _rim(scene, field, above, front.field, below))
+    register = replace(_pinned(lens, m, thickness), rim=_rim(scene, field, above, front.field, below))
     over = turned(front.field, below)
     exit_side = Part(alone(scene, base), field, above, "lens, exit side", False, register)
     return exit_side, Part(alone(scene, -(base + thickness)), *over, "lens, entrance side", True, register)
+
+
+def halves_of(upper: Part, scene: Scene, m: Milling | None, block: float | None) -> tuple[Part, Part]:
+    """The mould of a lens: its half above the exit, turned over, and that below the entrance.
+
+    Args:
+        upper: the mould of the exit alone; scene: with the entrance; m: as of `sides_of`, the stock that of a half, or None for
+            halves that are not machined; block: least material behind a surface, mm.
+
+    Raises:
+        InputError: the sides reach past each other, so that no flat faces fit between them.
+    """
+    front = entrance_of(scene.lens)
+    below = front.heights.double() + scene.lens.z_in
+    room = BLOCK * max(scene.lens.size) if block is None else block
+    halves = [replace(upper, kind="mould, exit side")]
+    halves.append(Part(alone(scene, float(below.min()) - room), front.field, below, "mould, entrance side"))
+    if m is None:
+        return halves[0], halves[1]
+    tops = [m.top(-half.field.least(-half.heights, Aperture()) - half.lens.z_in) for half in halves]
+    frame = between_backs(halves) - sum(tops)
+    if not frame > 0:
+        raise InputError(
+            f"⟨mould⟩: the faces of the halves would meet {-frame:.3g} mm too early, since the sides of this lens reach past each"
+            " other: a thicker lens (⟨lens.thickness⟩) has room between them; solids such as step need none"
+        )
+    found = [replace(h, register=replace(_pinned(scene.lens, m, top), frame=frame)) for h, top in zip(halves, tops, strict=True)]
+    return found[0], found[1]
+
+
+def between_backs(sides: Sequence[Part]) -> float:
+    """Distance between the flat backs of the halves of a closed mould, mm."""
+    return -sum(side.lens.z_in for side in sides)
+
+
+def registered(sides: Sequence[Part]) -> dict:
+    """The register of two sides as figures for JSON; nothing where they have none."""
+    found = {} if sides[0].register is None or len(sides) < 2 else sides[0].register.figures
+    if len(sides) > 1 and sides[0].kind.startswith("mould"):
+        found = found | {"between_backs_mm": between_backs(sides)}
+    return {"register": found} if found else {}
+
+
+def _pinned(lens: Lens, m: Milling, thickness: float) -> Register:
+    """A register by pins beside a lens, in a stock of this thickness, mm."""
+    beside = 2.0 * max(m.tool_radius, m.rough_radius) + m.pin
+    near = math.ceil(10.0 * (lens.opening.reach + beside)) / 10.0
+    far = near + 2.0 * m.pin
+    return Register(thickness, 2.0 * far + 4.0 * m.pin, lens.size[1] + 2.0 * beside, (near, -far), m.pin)
 
 
 def _rim(scene: Scene, field: HeightField, above: Tensor, front: HeightField, below: Tensor) -> float:

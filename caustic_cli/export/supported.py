@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from caustic_cli.export import AS_CUT, FORMATS, SOLIDS
+from caustic_cli.export import FORMATS, SOLIDS
 from caustic_cli.scene import Scene
 from caustic_cli.scene.traits import BEYOND_CLEAR, Capability
 
-#: Formats that hold a single refractive index, formats that hold all elements of a scene, and those that hold two free-form sides.
+#: Formats that hold a single refractive index, and formats that hold all elements of a scene.
 ONE_INDEX, WHOLE = ("lighttools", "zemax", "mitsuba"), ("lighttools", *SOLIDS, "mitsuba")
-TWO_SIDED = (*WHOLE, *AS_CUT)
 
-ONE_SIDE = (
-    f"⟨format⟩ {{format}} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both, without ⟨script⟩"
-    " or ⟨mould⟩"
-)
 ONE_LENS = f"⟨format⟩ {{format}} holds a single lens; with other elements {', '.join(WHOLE)} hold the scene, without ⟨script⟩"
 SHAPE = (
     "⟨format⟩ {format} holds one index, and this lens' varies;"
@@ -33,13 +28,13 @@ SCREEN = (
 #: Of BEYOND_CLEAR, what Mitsuba's files hold, and what has a message of its own.
 HELD = ("mirror", "gradient index", "tilted screen", "shifted screen", "far field")
 
-#: Beyond what ONE_INDEX and TWO_SIDED say.
+#: Beyond what ONE_INDEX says.
 _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     "zemax": {"other elements": ONE_LENS, "far field": SCREEN},
     "lighttools": {"laser beam": BEAM, "user-defined source": SOURCE, "far field": SCREEN},
     "phase": {
         **dict.fromkeys(
-            ("mirror", "gradient index", "other elements", "folded axis", "two sides", "several sources"),
+            ("mirror", "gradient index", "other elements", "folded axis", "several sources"),
             "⟨format⟩ phase is that of one lens for one source, not of {}",
         ),
         **dict.fromkeys(("ray file", "curved screen"), "⟨format⟩ phase needs a wave image, which there is none of with {}"),
@@ -66,19 +61,18 @@ _UNSUPPORTED: dict[str, Mapping[str, str]] = {
 
 
 def _exported(format: str) -> Capability:
-    two_sides = {} if format in TWO_SIDED else {"two sides": ONE_SIDE}
     index = {"gradient index": SHAPE} if format in ONE_INDEX else {}
-    return Capability(f"export to {format}", two_sides | index | _UNSUPPORTED.get(format, {}))
+    return Capability(f"export to {format}", index | _UNSUPPORTED.get(format, {}))
 
 
 EXPORT: dict[str, Capability] = {format: _exported(format) for format in FORMATS}
-MOULD = Capability("moulds", {"two sides": ONE_SIDE})
+MOULD = Capability("moulds", {})
 SCRIPT = Capability(
     "script for LightTools",
     {
         "laser beam": BEAM,
         "user-defined source": SOURCE,
-        "two sides": ONE_SIDE,
+        "two sides": "⟨script⟩ builds a solid with one free-form side; the archive alone holds both",
         **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
         **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
         "gradient index": SHAPE,

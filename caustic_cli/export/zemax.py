@@ -1,4 +1,4 @@
-"""Writer of Zemax OpticStudio Grid Sag files (`.DAT`) of the exit surface, with exact derivatives.
+"""Writer of Zemax OpticStudio Grid Sag files (`.DAT`) of a surface, with exact derivatives.
 
     ! comments
     nx ny delx dely unitflag xdec ydec      unitflag 0 is mm; the grid is centred
@@ -25,6 +25,7 @@ from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling, SurfaceGrid, co
 from caustic_cli.export.text import CREATED, real, rows
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Scene
 
 #: Least number of points along an axis in OpticStudio.
@@ -49,11 +50,15 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
     vertex = float(field.at(heights, *torch.zeros(2, 1, dtype=torch.float64), [(0, 0)])[0])
     columns = grid.z - vertex, grid.zx, grid.zy, grid.zxy
     table = np.stack([c[:, ::-1].T.ravel() for c in columns], -1)
-    lens, (sx, sy) = scene.lens, scene.screen.shift
+    lens, (sx, sy), behind = scene.lens, scene.screen.shift, "the flat entrance"
+    entrance = lens.z_in
+    if lens.entrance is not None:
+        front, behind = entrance_of(lens), "that of the entrance, which has a file of its own"
+        entrance += float(front.field.at(front.heights, *torch.zeros(2, 1, dtype=torch.float64), [(0, 0)])[0])
     head = [
         f"! {CREATED}",
         "! Grid Sag, mm; base radius infinity, conic 0; interpolation bicubic",
-        f"! vertex {real(vertex - lens.z_in)} mm behind the flat entrance, index {real(lens.index)},"
+        f"! vertex {real(vertex - entrance)} mm behind {behind}, index {real(lens.index)},"
         f" screen {real(scene.screen.z - vertex)} mm behind the vertex",
         *([f"! light along ({', '.join(map(real, scene.source.axis))}), a unit vector"] if scene.source.oblique else []),
         *([f"! screen decentred by x {real(sx)} mm, y {real(sy)} mm"] if any((sx, sy)) else []),

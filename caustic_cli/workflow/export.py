@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -14,11 +15,11 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError, alternatives
-from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES
+from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES, SIDE_BY_SIDE
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.part import Part, part_of, turned
 from caustic_cli.export.reading import Reading, Readings
-from caustic_cli.export.register import other, sides_of, with_stock
+from caustic_cli.export.register import other, parts_of, registered, with_stock
 from caustic_cli.export.supported import EXPORT, refuse
 from caustic_cli.io.heightmaps import beside
 from caustic_cli.optics import finishing
@@ -84,40 +85,30 @@ class Exporter:
         """
         scene = at_own_wavelength(self.scene)
         refuse(scene, format, script, mould)
-        if format in AS_CUT and scene.lens.entrance is not None:
-            return self._write_sides(path, format, scene, Milling(**(milling or {})), given)
-        if "pin" in (milling or {}):
+        m = Milling(**(milling or {}))
+        sides = parts_of(format, scene, self.field, self.heights, m, mould, block)
+        if "pin" in (milling or {}) and sides[0].register is None:
             raise InputError("⟨pin⟩ is of a lens with two free-form sides, which is turned over onto pins; this one has one side")
-        part = part_of(format, scene, self.field, self.heights, mould, block)
-        home = _home(format)
-        writer = getattr(home, f"write_{format}")
+        home, paths = _home(format), (path, other(path))[: len(sides)]
         if format == "gcode":
-            found = writer(path, part, Milling(**(milling or {})), **given)
-            return {"milling": found | _scallops(scene, self.field, found)}
-        scripts = import_module("caustic_cli.export.lighttools_script") if script else None
-        arguments = _arguments(format, part)
-        file, judged = File(home, arguments, path if format == "heightmap" else None, part), hasattr(home, "readings")
+            found, *back = (home.write_gcode(p, s, with_stock(m, s), **given) for p, s in zip(paths, sides, strict=True))
+            entrance = {"entrance": back[0]} if back else {}
+            return {"milling": found | _scallops(scene, self.field, found)} | entrance | registered(sides)
+        each = [_file(format, p, s) for p, s in zip(paths, sides, strict=True)]
+        file = each[0] if len(sides) == 1 else BothSides(**vars(each[0]), other=each[1], scene=scene)
+        judged = hasattr(home, "readings")
         more = {key: given.pop(key) for key in getattr(home, "MORE", ()) if key in given}
         choice = given if not judged or {"samples", "tolerance"} & set(given) else self.smallest(file)
-        written = writer(path, *arguments, **choice, **more)
-        if scripts is not None:
-            scripts.write_script(path, scene, self.field, self.heights, choice.get("samples"))
+        writer = getattr(home, f"write_{format}")
+        written, *_ = [writer(p, *one.arguments, **choice, **more) for p, one in zip(paths, each, strict=True)]
+        if script:
+            import_module("caustic_cli.export.lighttools_script").write_script(
+                path, scene, self.field, self.heights, choice.get("samples")
+            )
         found = self.figures(file, choice, format) if judged else {}
         if written is not None:
             found[format] = {key: value for key, value in written.items() if key != "spline"}
-        return found
-
-    def _write_sides(self, path: Path, format: str, scene: Scene, m: Milling, given: dict) -> dict:
-        """Both sides of a lens with two free-form ones, in two files, for a machine."""
-        sides, paths, home = sides_of(scene, self.field, self.heights, m), (path, other(path)), _home(format)
-        if format == "gcode":
-            found, back = (home.write_gcode(p, s, with_stock(m, s), **given) for p, s in zip(paths, sides, strict=True))
-            return {"milling": found | _scallops(scene, self.field, found), "entrance": back, "register": sides[0].register.figures}
-        file = BothSides(home, (sides[0],), path, sides[0], other=File(home, (sides[1],), paths[1], sides[1]), scene=scene)
-        choice = given or self.smallest(file)
-        for p, s in zip(paths, sides, strict=True):
-            said = home.write_heightmap(p, s, **choice)
-        return self.figures(file, choice, format) | {"register": said["register"]}
+        return found | registered(sides)
 
     def error(self, file: File, choice: dict, key: str | None = None) -> float:
         """Relative RMS error of the picture through a file; key: which of its readings, that by which it is chosen unless given."""
@@ -181,8 +172,7 @@ class Exporter:
         if not EXPORT[format].supports(self.scene):
             return False
         part = part_of(format, self.scene, self.field, self.heights)
-        path = Path(f"lens{FORMATS[format][0]}")
-        file = File(_home(format), _arguments(format, part), path if format == "heightmap" else None, part)
+        file = _file(format, Path(f"lens{FORMATS[format][0]}"), part)
         return self.error(file, file.choices(MOST_BYTES)[-1], "error") <= self.picture.largest
 
 
@@ -237,7 +227,7 @@ class File:
 
 @dataclass(frozen=True, eq=False)
 class BothSides(File):
-    """The exit of a lens with two free-form sides; other: its entrance; read together."""
+    """The exit of a lens with two free-form sides, or of its mould; other: its entrance; read together."""
 
     other: File = field(kw_only=True)
     scene: Scene = field(kw_only=True)
@@ -245,13 +235,14 @@ class BothSides(File):
     def readings(self, choice: dict) -> Readings:
         """As of a file, the exit with the entrance as read from its own."""
 
-        def both() -> Reading:
+        def both(read: Callable[[], Reading]) -> Reading:
             entrance, heights = self.other.in_the_scene(self.other.readings(choice)["error"]())
-            assert isinstance(entrance, HeightField) and heights is not None
-            exit_side = super(BothSides, self).readings(choice)["error"]()
-            return replace(exit_side, entrance=freeform_of(entrance, heights - self.scene.lens.z_in))
+            if heights is None:  # facets, beside which the entrance is the designed one
+                return read()
+            assert isinstance(entrance, HeightField)
+            return replace(read(), entrance=freeform_of(entrance, heights - self.scene.lens.z_in))
 
-        return {"error": both}
+        return {key: partial(both, read) for key, read in super().readings(choice).items()}
 
 
 def export(
@@ -284,7 +275,7 @@ def export(
     began = time.monotonic()
     which = "" if at is None else f"-{at.replace(' ', '').replace(',', '-').replace('=', '-')}"
     path = output or Path(opened.path.resolve().stem + which + FORMATS[format][0])
-    written = files(path, exporter.scene, format, script)
+    written = files(path, exporter.scene, format, script, given.get("mould", False))
     printer = finishing.printer(opened.settings.lens.finish)
     if printer is not None and "printer" in getattr(_home(format), "MORE", ()):
         given = {"printer": printer} | given
@@ -354,6 +345,10 @@ def accuracy_words(figures: dict) -> str:
     return f"{text}; warning: this file does not keep the picture; {kept}"
 
 
+def _file(format: str, path: Path, part: Part) -> File:
+    return File(_home(format), _arguments(format, part), path if format == "heightmap" else None, part)
+
+
 def _arguments(format: str, part: Part) -> tuple:
     return (part,) if format in AS_CUT else (part.scene, part.field, part.heights)
 
@@ -372,12 +367,13 @@ def _scallops(scene: Scene, field: HeightField, found: dict) -> dict:
     return import_module("caustic_cli.studies.scallops").scallops(scene, found["step_over_mm"], found["tool_radius_mm"])
 
 
-def files(path: Path, scene: Scene, format: str, script: bool = False) -> list[Path]:
+def files(path: Path, scene: Scene, format: str, script: bool = False, mould: bool = False) -> list[Path]:
     """All files of an export, the lens first."""
-    paths = [path, other(path)] if format in AS_CUT and scene.lens.entrance is not None else [path]
+    both = scene.lens.entrance is not None and (mould or format in SIDE_BY_SIDE)
+    paths = [path, other(path)] if both else [path]
     if format == "heightmap":
         return [name for p in paths for name in (p, beside(p))]
-    if format == "gcode":
+    if both:
         return paths
     if format == "phase":
         return [path, *_home(format).companions(path)]

@@ -154,7 +154,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
         out.say(*_head(part, m, step, scallop, top, digits, tolerance))
         place = file.tell()
         out.say(" " * COUNTED, f"{'G21' if unit == 1.0 else 'G20'} G90 G17 G94")
-        if part.register is not None and not part.turned:
+        if part.register is not None and part.register.drills(part.turned):
             _drill(out, m, part.register, safe)
         if m.roughing is not None:
             _begin(out, m.roughing_tool, m.rough_radius, m.spindle, safe)
