@@ -11,9 +11,16 @@ import torch
 from scipy.interpolate import BivariateSpline
 
 from caustic_cli.inverse.initial_two_sided import first_sides
+from caustic_cli.inverse.schedule import LossImage
+from caustic_cli.inverse.two_sided_objective import TwoSidedObjective
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import split_heights
-from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen, SecondTarget
+from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Points, Scene, Screen, SecondTarget
+from caustic_cli.scene.sources.rays import Measured
+from caustic_cli.scene.sources.rayset import RaySet
+from caustic_cli.scene.sources.several import together
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures
 
@@ -83,3 +90,50 @@ def test_another_tracer_finds_the_picture_of_light_at_an_angle(tilt, screen, sec
     assert figures["angle_rms_mrad"] == pytest.approx(1e3 * angle, rel=0.2)  # of few rays, at creases
     seen = retrace(behind, field, exit, target, rays=40_000)[0].image.numpy().reshape(8, 3, 8, 3).sum((1, 3))
     assert np.abs(seen / seen.sum() - fields).max() < 0.06 * fields.max()
+
+
+def figures_of(scene: Scene, rays: int = 100_000) -> dict:
+    """Of the initial surfaces, by the program's own rays."""
+    field, target = HeightField.of(LENS), picture()
+    nets = first_sides(scene, target, None, field, 64)
+    behind, exit = split_heights(scene, field, nets)
+    found = retrace(behind, field, exit, target, rays=rays)[1]
+    return found | second_figures(behind, field, exit, None, rays=rays, seed=1)[1]
+
+
+def test_rays_of_a_file_are_collimated_as_those_of_the_source_they_are_of():
+    """A cone of a file's rays that come from a point, as intense as the point: the rays of either are drawn by another."""
+    rng, place = np.random.default_rng(3), np.array([0.4, -0.3, -60.0])
+    along = 1.0 - rng.uniform(0.0, 1.0 - np.cos(np.radians(8.0)), 200_000)
+    around, across = rng.uniform(0.0, 2.0 * np.pi, along.size), np.sqrt(1.0 - along**2)
+    directions = np.stack([across * np.cos(around), across * np.sin(around), along], 1)
+    rays = RaySet(np.zeros((along.size, 3)), directions, np.ones(along.size))
+    scenes = [
+        Scene(source, LENS, UPRIGHT, second_target=SecondTarget())
+        for source in (Measured(rays, tuple(place)), Points((tuple(place),), cone=8.0))
+    ]
+    file, point = (figures_of(scene) for scene in scenes)
+    assert file["angle_rms_mrad"] == pytest.approx(point["angle_rms_mrad"], rel=0.15)
+    assert file["relative_rms"] < 0.25 and file["on_screen"] == pytest.approx(point["on_screen"], rel=0.02)
+
+
+def test_several_sources_are_their_sum_and_their_directions_remain():
+    """Equal ones are one; light of two directions is as far apart behind the lens as etendue asks for."""
+    one, pair = (
+        Scene(s, LENS, UPRIGHT, second_target=SecondTarget())
+        for s in (PlaneWave(), together([PlaneWave(), PlaneWave(2.0)], [Light()] * 2))
+    )
+    field, target = HeightField.of(LENS), torch.from_numpy(picture())
+    nets = [first_sides(scene, target.numpy(), None, field, 64) for scene in (one, pair)]
+    assert (nets[0] - nets[1]).abs().median() < 5e-3  # the exit is fitted to half as many rays of each
+    filter = Filter("cosine", (3, 3))
+    found = [
+        TwoSidedObjective(s, field, rays_of(s, "grid", n), (target,), "rms", LossImage(filter))(nets[0])
+        for s, n in ((one, 10_000), (pair, 20_000))
+    ]
+    assert found[0].loss == pytest.approx(found[1].loss, rel=5e-3)  # of other numbers of rays
+    assert (found[0].gradient - found[1].gradient).norm() < 0.1 * found[0].gradient.norm()
+    apart = replace(pair, source=together([PlaneWave(tilt=(0.0, a)) for a in (-0.5, 0.5)], [Light()] * 2))
+    share = target / target.sum()
+    denser = float((share * share).sum()) * 100.0 / 0.25  # mean irradiance over that on the lens: the angle's square
+    assert figures_of(apart)["angle_rms_mrad"] == pytest.approx(1e3 * math.radians(0.5) * math.sqrt(denser), rel=0.1)

@@ -25,7 +25,6 @@ _TWO_SIDES = {
         ("lens.mirror", "lens.gradient", "lens.array", "design.network", "design.optimizer"),
         "⟨{path}⟩ cannot be combined with ⟨{feature}⟩, which needs two free-form sides of heights by lbfgs",
     ),
-    **dict.fromkeys(("source.also", "source.type rays"), "⟨{feature}⟩ needs one source that is no ray file"),
     "design.waves on": WAVE_REFINEMENT.unsupported["two sides"],
 }
 

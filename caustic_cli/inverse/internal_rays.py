@@ -37,7 +37,8 @@ def internal_rays(scene: Scene, field: HeightField, nets: Tensor, count: int) ->
     for traced in tracers(lit, field, rays_of(lit, "grid", count), torch.float64, CHUNK):
         last = traced.last({EXIT: net})
         hit = last.hit
-        full = [*last.state.full(hit.local), *last.state.full(hit.incoming), last.power_in, torch.as_tensor(hit.length)]
+        power = traced.weight * last.power_in
+        full = [*last.state.full(hit.local), *last.state.full(hit.incoming), power, torch.as_tensor(hit.length)]
         found.append(torch.stack(torch.broadcast_tensors(*full))[:, last.power_in > 0])
     rays = torch.cat(found, 1).numpy()
     exit, direction = rays[:3], rays[3:6]
