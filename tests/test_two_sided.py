@@ -239,7 +239,8 @@ def test_design_render_resume_and_files(_here, capfd):
     assert "free-form on both sides" in page
     wall = float(re.search(r">Wall<.*?>([0-9.]+) mm", page)[1])
     assert wall == pytest.approx((top - low).min(), abs=1e-3)
-    assert "holds one free-form side" in run(capfd, "export", "p", "--format", "zemax", code=2)
+    files = run(capfd, "export", "p", "--format", "zemax", "--max-size", "1MB", "--quiet", "--json")
+    assert files["beside"] == ["p-entrance.dat"] and files["keeps_picture"]
 
 
 def test_the_image_changes_with_a_height_of_the_exit_as_differences_say(_here, capfd):
@@ -398,15 +399,14 @@ def test_a_disc_s_light_is_collimated(_here, capfd, monkeypatch, sun):
         (("--collimate", "--mirror"), "--mirror cannot be combined with --collimate"),
         (("--second", "two.png", "--second-at", "400", "--color"), "the second picture has no colours"),
         (("--focus", "0,0,20"), "must lie behind the picture's screen at 50 mm"),
-        (("--collimate", "--waves", "on"), "--waves on"),
         (("--collimate", "--source", "point", "--start", "offset"), "must be transport"),
         (("--second", "missing.png", "--second-at", "400"), "missing.png"),
-        (("--collimate", "--config", "waves.toml"), "without waves or spread"),
+        (("--collimate", "--config", "waves.toml"), "without spread"),
         (("--collimate", "--mag", "6"), "would have to come from outside the lens"),
     ],
 )
 def test_bad_input_is_refused(_here, capfd, options, words):
-    Path("waves.toml").write_text("[[design.stages]]\nwaves = [550.0]\n")
+    Path("waves.toml").write_text("[[design.stages]]\nspread = true\n")
     small = [a for a in SMALL if "waves.toml" not in options or a not in ("--rays", "40000")]
     said = run(capfd, "design", "one.png", *small, *options, "-o", "p", code=2)
     assert words in said and said.count("\n") == 0 and not Path("p").exists()

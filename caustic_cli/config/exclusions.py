@@ -20,13 +20,10 @@ _LENSLETS = (
     "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none and optimizer"
     " lbfgs"
 )
-_TWO_SIDES = {
-    **dict.fromkeys(
-        ("lens.mirror", "lens.gradient", "lens.array", "design.network", "design.optimizer"),
-        "⟨{path}⟩ cannot be combined with ⟨{feature}⟩, which needs two free-form sides of heights by lbfgs",
-    ),
-    "design.waves on": WAVE_REFINEMENT.unsupported["two sides"],
-}
+_TWO_SIDES = dict.fromkeys(
+    ("lens.mirror", "lens.gradient", "lens.array", "design.network", "design.optimizer"),
+    "⟨{path}⟩ cannot be combined with ⟨{feature}⟩, which needs two free-form sides of heights by lbfgs",
+)
 
 _BOTH = "⟨{feature}⟩ and ⟨{path}⟩ both define the light behind the picture: give one of them"
 _SECOND = (("second.file", "second.collimate", "second.focus"), ("second.collimate", "second.focus"), ("second.focus",))

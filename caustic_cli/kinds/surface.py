@@ -92,6 +92,19 @@ class Described(Protocol):
         """The second target on its screen, or None."""
 
 
+def refuse_contradiction(asked: str, d: Defaults) -> None:
+    """Refuse given stages that contradict design.waves.
+
+    Raises:
+        InputError: they do.
+    """
+    if asked != "auto" and any(stage.waves for stage in d.design.stages) != (asked == "on"):
+        raise InputError(
+            f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
+            + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves")
+        )
+
+
 class Ahead(NamedTuple):
     """The objective of stage k in a scene, made before its turn for these initial heights (n, m) mm."""
 
@@ -160,11 +173,7 @@ class OneSurface(Problem):
         cls.complete_control(d)
         d.fill_design(preconditioner="laplacian" if d.plain and not cls.exact_start(d) else "none")
         if d.complete_given_stages():
-            if asked != "auto" and any(stage.waves for stage in d.design.stages) != (asked == "on"):
-                raise InputError(
-                    f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
-                    + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves")
-                )
+            refuse_contradiction(asked, d)
             return
         waves = wave_stages(d.s, d.source, d.effort, d.lit)
         stages = cls.default_stages(d, waves) + waves
@@ -327,8 +336,8 @@ class OneSurface(Problem):
             return False
         return True
 
-    def on_waves(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
-        """The objective of stage k on the wave image.
+    def on_waves(self, scene: Scene, k: int, initial: Tensor, target: Tensor | None = None) -> LossOfHeights:
+        """The objective of stage k on the wave image; target: another than the picture's.
 
         Raises:
             Skipped: there is none, and it is not asked for; else NoWaveImage.
@@ -339,7 +348,7 @@ class OneSurface(Problem):
                 scene,
                 self.field(k),
                 initial,
-                self.target,
+                self.target if target is None else target,
                 o.loss,
                 stage.rendering,
                 o.limits,
@@ -524,7 +533,7 @@ class OneSurface(Problem):
             if (found := self.beam_error(designer, state, objective)) is not None:
                 return found
             approximately = {} if objective is None else {"image_at": cast(Any, objective).image_at}
-            lens = self.scene, designer.field(state.stage), state.heights.to(self.device)
+            lens = trace_arguments(self.scene, designer.field(state.stage), state.heights.to(self.device))
             if (error := by_waves.fast_error(*lens, self.target.numpy(), used, **approximately)) is not None:
                 return error
         rays = max(1, int(evaluation_rays(self.scene, self.effort.final_rays) / max(1.0, self.further_retraces)))

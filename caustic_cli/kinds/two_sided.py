@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -11,11 +11,13 @@ from torch import Tensor
 
 from caustic_cli.config.default_stages import refinement
 from caustic_cli.config.settings import Settings
+from caustic_cli.config.wave_stages import wave_stages
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.internal_rays import entrance_points
+from caustic_cli.inverse.mixture import Member, Mixture
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.parametrisation import Heights, SidesTogether
 from caustic_cli.inverse.target import grey
@@ -23,8 +25,11 @@ from caustic_cli.inverse.two_sided_objective import TwoSidedObjective
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.evaluation import Evaluated, radius_figures
 from caustic_cli.kinds.several_surfaces import SeveralSurfaces
-from caustic_cli.kinds.surface import Described
+from caustic_cli.kinds.surface import Described, refuse_contradiction
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.scene import Scene
 from caustic_cli.schema.table import LensSettings, ScreenSettings, check
@@ -32,9 +37,16 @@ from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures
 
+if TYPE_CHECKING:
+    from caustic_cli.optics.waves.image import WaveImage
+
+by_waves = OnDemand("caustic_cli.studies.waves")
+
 THICK, SAG = 2.0, 0.45  # thickness over width of the lens, and largest height of a side over thickness
 #: Factor of the iterations for two pictures, which the initial surfaces pair to first order in the angles only.
 LONGER = 2.5
+#: Figures of the initial surfaces that are kept.
+STARTED = ("relative_rms", "wave_relative_rms", "second_relative_rms", "angle_rms_mrad")
 #: Divisor of the rays for the initial surfaces.
 STARTS = 4
 
@@ -46,7 +58,7 @@ class TwoSides(SeveralSurfaces):
         second_target: (k_x, k_y) irradiance on the scene's second screen, where it has one.
     """
 
-    adapts = False
+    adapts, refines_waves = False, True
 
     def __init__(self, *args: Any, second_target: Tensor | None = None, **more: Any):
         self.second_target = second_target
@@ -68,7 +80,7 @@ class TwoSides(SeveralSurfaces):
 
     @classmethod
     def complete(cls, d: Defaults) -> None:
-        check("design.waves", d.design.waves)
+        asked = check("design.waves", d.design.waves)
         d.fill_design(start="transport")
         if d.design.start != "transport":
             raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {d.design.start}")
@@ -77,11 +89,12 @@ class TwoSides(SeveralSurfaces):
         if not d.complete_given_stages():
             longer = 1.0 if d.s.chosen("second.file") is None else LONGER
             stages = refinement(d.lens.control, d.rays, d.resolution, d.effort.sides)
-            d.set_stages([stage | {"iterations": round(longer * stage["iterations"])} for stage in stages])
-        elif any(stage.get(key) for stage in d.design.stages for key in ("waves", "spread")):
-            raise InputError(
-                "[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread"
-            )
+            stages = [stage | {"iterations": round(longer * stage["iterations"])} for stage in stages]
+            d.set_stages(stages + (wave_stages(d.s, d.source, d.effort, d.lit) if asked == "on" else []))
+            return
+        refuse_contradiction(asked, d)
+        if any(stage.spread for stage in d.design.stages):
+            raise InputError("[[design.stages]] of two free-form sides are on the rays of the whole source, without spread")
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:
@@ -97,7 +110,7 @@ class TwoSides(SeveralSurfaces):
         return torch.stack([-most, low]), torch.stack([most, high])
 
     def parametrised(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
-        if start is None:
+        if start is None or self.stages[k].waves:
             return super().parametrised(k, start, loaded)
         light = None if loaded else entrance_points(self.scene, self.field(k), start)
         laplacian = self.options.parametrisation.preconditioner == "laplacian"
@@ -105,9 +118,38 @@ class TwoSides(SeveralSurfaces):
 
     def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         stage, o, scene = self.stages[k], self.options, self.lit(scene, k)
+        if stage.waves:
+            return self.exit_on_waves(scene, k, initial)
         targets = (self.target,) if self.second_target is None else (self.target, self.second_target)
         rays = rays_of(scene, stage.sampler, stage.rays, self.seed(k), self.device)
         return TwoSidedObjective(scene, self.field(k), rays, targets, o.loss, stage.rendering, limits=o.limits, dtype=o.dtype)
+
+    def exit_on_waves(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
+        """The loss of the exit alone on the wave images of both pictures, behind the entrance as it is.
+
+        Raises:
+            Skipped, NoWaveImage: as of `on_waves`.
+        """
+        behind, exit = split_heights(scene, self.field(k), initial)
+        seen = [(behind.screen, self.target)]
+        if self.second_target is not None and scene.second_target is not None and scene.second_target.screen is not None:
+            seen.append((scene.second_target.screen, self.second_target))
+        part = 1.0 / len(seen)
+        members = [
+            Member(self.on_waves(behind.onto(screen), k, exit, target), part, part, float(not n), where=(1,))
+            for n, (screen, target) in enumerate(seen)
+        ]
+        return Mixture(members, 2.0)
+
+    def seen_by_waves(
+        self, field: HeightField, heights: Tensor, size: tuple[float, float], required: bool = True
+    ) -> tuple[WaveImage | None, dict[str, Any]]:
+        """The wave image of a lens and its figures, also at wavelengths that were not refined; size: of the picture, mm; required:
+        that there is one, where it was asked for."""
+        scene, exit = split_heights(self.scene, field, heights.to(self.device))
+        target, needed = self.target.numpy(), required and self.options.waves
+        light, figures = by_waves.wave_figures(scene, field, exit, target, Resolution.before(scene, size), required=needed)
+        return light, figures | (by_waves.unseen_figures(scene, field, exit, target) if light is not None and required else {})
 
     def refuse_unreachable(self) -> None:
         """Its own initial surfaces say what they cannot reach."""
@@ -123,6 +165,7 @@ class TwoSides(SeveralSurfaces):
         """By the picture, and a second picture or the ray directions behind it."""
         target, field, seed = self.target.numpy(), designer.field(state.stage), self.options.seed
         farther, final = None if self.second_target is None else self.second_target.numpy(), self.effort.final_rays
+        refined = any(stage.waves for stage in designer.stages[: state.stage + 1])
 
         def trace(heights: Tensor, rays: int) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
             scene, exit = split_heights(self.scene, field, heights)
@@ -132,14 +175,19 @@ class TwoSides(SeveralSurfaces):
             return exposure.image.cpu().numpy(), second, figures | more
 
         image, second, figures = trace(state.heights, final)
+        light = None
+        if refined:
+            light, more = self.seen_by_waves(field, state.heights, size)
+            figures |= more
         if state.start is not None:
-            initial = trace(designer.initial_surface(state), final // STARTS)[2]
-            figures |= {"start_error": initial["relative_rms"]}
-            figures |= {
-                f"start_{key}": initial[key] for key in ("relative_rms", "second_relative_rms", "angle_rms_mrad") if key in initial
-            }
+            begun = designer.initial_surface(state)
+            initial = trace(begun, final // STARTS)[2]
+            if light is not None:
+                initial |= self.seen_by_waves(field, begun, size, required=False)[1]
+            figures |= {"start_error": judged(initial, light is not None)["error"]}
+            figures |= {f"start_{key}": initial[key] for key in STARTED if initial.get(key) is not None}
             if state.unrounded is not None:
                 unrounded = trace(designer.initial_surface(state, rounded=False), final // STARTS)[2]
                 figures |= {"min_radius": radius_figures(self.options.limits.min_radius, initial, unrounded)}
         pair = None if second is None or farther is None else (second, farther)
-        return Evaluated(state, judged(figures, False), image, farther=pair)
+        return Evaluated(state, judged(figures, refined), image, None if light is None else light.image.cpu().numpy(), farther=pair)

@@ -11,6 +11,8 @@ from torch import Tensor
 #: Largest number of iterations, and least number at the edges of dark regions; fraction of the distance to the centre of the light
 #: by which rays that have always been blocked move in each iteration; iterations after which the wavefront's curvature is known.
 TRIES, AT_EDGES, INWARDS, SETTLING = 16, 10, 0.02, 2
+#: Longest step from rays of a survey, in parts of the pupil: half the distance of its rays.
+NEAR = 1.0 / 128.0
 
 
 def aimed_rays(
@@ -68,11 +70,12 @@ def aimed_rays(
 
 
 def _local(u: Tensor, v: Tensor, shape: tuple[int, int], step: tuple[float, float]) -> Callable[..., tuple]:
-    """As of `Survey.toward`, by the changes of u and v (N,) along the grid."""
+    """As of `Survey.toward`, by the changes of u and v (N,) along the grid, and by NEAR at most: at the corners of the light, where
+    these are uncertain, rays must not be thrown across the pupil."""
     by = [[g.reshape(-1) for g in torch.gradient(c.view(shape), spacing=step, dim=(0, 1))] for c in (u, v)]
 
     def toward(x: Tensor, y: Tensor, some: Tensor | slice) -> tuple[Tensor, Tensor]:
-        a, b = (gx[some] * x + gy[some] * y for gx, gy in by)
+        a, b = ((gx[some] * x + gy[some] * y).clamp(-NEAR, NEAR) for gx, gy in by)
         return a, b
 
     return toward

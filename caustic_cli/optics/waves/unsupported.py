@@ -28,8 +28,6 @@ WAVE_REFINEMENT = Capability(
     {
         "ray file": "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
         "several sources": "⟨design.waves⟩ on needs one source: light of several is refined by rays alone",
-        "two sides": "⟨design.waves⟩ on: two free-form sides are refined by rays alone, since those of a picture's creases cross"
-        " inside the glass, so that the light behind it has no single wavefront",
     },
 )
 WAVES_BY_DEFAULT = Capability(
@@ -37,6 +35,8 @@ WAVES_BY_DEFAULT = Capability(
     {
         "ray file": WAVE_IMAGE.unsupported["ray file"],
         "several sources": "light of several sources is refined by rays alone",
+        "two sides": "behind the creases of a free-form entrance rays cross inside the glass, and light without a single wavefront"
+        " has none; ⟨waves⟩ on refines the exit where there are no creases",
         "other elements": "behind other elements it takes many samples, or a part of the light; ⟨waves⟩ on refines it all the same",
         "lenslet array": "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on"
         " refines it",

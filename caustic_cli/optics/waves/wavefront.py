@@ -243,16 +243,18 @@ class Survey:
     places: tuple[Tensor, ...] | None = None
 
     def aim(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """u and v for intercepts (N,), mm: of the fit, or where there are `places` linear between them."""
-        linear = self.toward(x - self.offset[0], y - self.offset[1])
+        """u and v for intercepts (N,), mm: of the fit, or where there are `places` linear between them, and beyond them of the fit
+        from the nearest one on."""
         if self.places is None:
-            return linear
-        u, v, *of = (c.cpu().numpy() for c in self.places)
-        at = np.stack([c.cpu().numpy() for c in (x, y)], -1)
-        found = interpolate_nd.LinearNDInterpolator(np.stack(of, -1), np.stack([u, v], -1))(at)
-        return tuple(
-            torch.where(torch.isfinite(c), c, a) for c, a in zip(torch.from_numpy(found).to(x).unbind(-1), linear, strict=True)
-        )  # type: ignore[return-value]
+            return self.toward(x - self.offset[0], y - self.offset[1])
+        u, v, px, py = (c.cpu().numpy() for c in self.places)
+        at, of, to = (np.stack(pair, -1) for pair in ((x.cpu().numpy(), y.cpu().numpy()), (px, py), (u, v)))
+        found = interpolate_nd.LinearNDInterpolator(of, to)(at)
+        beyond = np.isnan(found).any(-1)
+        there, near = at[beyond], interpolate_nd.NearestNDInterpolator(of, np.concatenate([of, to], -1))(at[beyond])
+        found[beyond] = near[:, 2:] + np.stack(self.toward(*(there - near[:, :2]).T), -1)
+        there_u, there_v = torch.from_numpy(found).to(x).unbind(-1)
+        return there_u, there_v
 
     def toward(self, x, y, _some: Tensor | slice = slice(None)) -> tuple:
         """Changes of u and v for changes of the intercepts, mm, tensors or numbers; of which rays does not matter."""
