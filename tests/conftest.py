@@ -95,7 +95,7 @@ LONG = (
     "test_the_commands_of_a_chapter_run[5-accuracy]",
     "test_the_commands_of_a_chapter_run[6-thesis]",
     "test_the_commands_of_a_chapter_run[17-lamp]",
-    "test_two_ranks_draw_the_bytes_of_one",
+    "test_draws_and_finishes_are_the_bytes_of_one_process",
     "test_the_commands_of_a_chapter_run[13-other-elements]",
     "test_the_commands_of_a_chapter_run[16-window]",
     "test_the_python_of_a_chapter_runs[7-library]",

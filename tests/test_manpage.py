@@ -75,6 +75,7 @@ def test_sections_in_the_usual_order():
         "COMPLETION",
         "EXIT STATUS",
         "ENVIRONMENT",
+        "SEVERAL PROCESSES",
         "EXAMPLES",
     ]
 

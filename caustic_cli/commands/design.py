@@ -11,7 +11,6 @@ import typer
 
 from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError
-from caustic_cli.schema import checks
 from caustic_cli.schema.table import TABLE, default
 
 EXAMPLES = """Examples:
@@ -94,8 +93,6 @@ class DesignOptions(options.Computation):
 
 def run(asked: DesignOptions) -> None:
     """Compute the lens whose caustic is the picture TARGET."""
-    speaks = checks.rank_and_size()[0] == 0  # under torchrun, rank 0
-    asked.quiet = asked.quiet or not speaks
     say, target = asked.say, asked.target
     _check(asked)
     if asked.correct:
@@ -103,19 +100,16 @@ def run(asked: DesignOptions) -> None:
         return
     piped = not asked.resume and str(target) == "-"
     path = asked.out or Path(f"{'picture' if piped else target.stem or 'design'}.caustic")
-    project, picture = target if target.is_dir() else path, target
-    if speaks:
-        picture = _check_before_torch(asked, project)
-        if not asked.resume:  # as early as possible, while this process loads the libraries
-            from caustic_cli.optics.kernels.ahead import compile_behind  # noqa: PLC0415
+    project = target if target.is_dir() else path
+    picture = _check_before_torch(asked, project)
+    if not asked.resume:  # as early as possible, while this process loads the libraries
+        from caustic_cli.optics.kernels.ahead import compile_behind  # noqa: PLC0415
 
-            compile_behind(["multigrid"], more=True)
-    device = asked.start_torch(shared=True)
+        compile_behind(["multigrid"], more=True)
+    device = asked.start_torch()
 
     from caustic_cli.config.lamp import asks_for_lamp, says_lamp  # noqa: PLC0415
-    from caustic_cli.optics import ranks  # noqa: PLC0415
     from caustic_cli.workflow import lamp, library  # noqa: PLC0415
-    from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
     for_lamp = says_lamp(project) if asked.resume else asks_for_lamp(asked.given, asked.preset, asked.config)
     if for_lamp:
@@ -124,10 +118,7 @@ def run(asked: DesignOptions) -> None:
     if asked.plan:
         _print_plan(asked, picture)
         return
-    with _saying_what_is_kept(project if asked.resume else path), ranks.process_group(device) as rank:
-        if rank > 0:
-            follow()
-            return
+    with _saying_what_is_kept(project if asked.resume else path):
         how: dict[str, Any] = {"force": asked.force, "movie": asked.movie, "say": say, "device": device}
         if asked.resume:
             iterations, time_limit = (asked.given.get(setting) for setting in CONTINUED)
@@ -170,10 +161,8 @@ def _refuse_for_lamps(asked: DesignOptions) -> None:
     """Refuse what no lamp is designed with.
 
     Raises:
-        InputError: several processes, or --plan.
+        InputError: --plan.
     """
-    if checks.rank_and_size()[1] > 1:
-        raise InputError("a lamp is designed by one process, and torchrun has started more")
     if asked.plan:
         raise InputError("--plan is for a lens before its light, not for a lamp around it")
 

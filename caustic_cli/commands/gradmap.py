@@ -66,6 +66,7 @@ def run(asked: GradmapOptions) -> None:
 
     from caustic_cli.config.lamp import says_lamp  # noqa: PLC0415
     from caustic_cli.io.picture import write_npy  # noqa: PLC0415
+    from caustic_cli.optics import ranks  # noqa: PLC0415
     from caustic_cli.studies.gradmap import plot_gradient  # noqa: PLC0415
     from caustic_cli.workflow.derivatives import OfLamp, OfLens  # noqa: PLC0415
 
@@ -82,8 +83,8 @@ def run(asked: GradmapOptions) -> None:
         if not (0 <= i < shape[0] and 0 <= j < shape[1]):
             raise InputError(f"--control must be I,J with I 0 to {shape[0] - 1} and J 0 to {shape[1] - 1}, got {i},{j}")
     maps = []
-    for point, (image, npy) in zip(points, _files(asked, points), strict=True):
-        gradient = derivative.image(point)
+    files = _files(asked, points)
+    for point, (image, npy), gradient in zip(points, files, ranks.mapped(derivative.image, points), strict=True):
         title = f"derivative with respect to control height {point[0]}, {point[1]}"
         plot_gradient(image, gradient, derivative.screen, title, derivative.unit)
         if npy is not None:

@@ -262,6 +262,13 @@ directory of the user among the temporary files is used.  Kernels that have not 
 .TP
 .B NO_COLOR
 If set to any value, output is not coloured.
+.SH SEVERAL PROCESSES
+Every command runs under
+.BR torchrun ,
+on one host or several: "torchrun \-\-nproc\-per\-node 4 \-m \-\- caustic_cli render flame.caustic \-\-tolerances errors.toml".
+The first process reads and writes all files.  Draws, times of day, finishes, most studies, and the rays, wavefronts, lenslets or
+draws of designs are shared; what is not shared is done by the first process.  Results are the same to the last bit for any number
+of processes.  A lost process ends the command with one line and status 1 or 143.
 .SH EXAMPLES
 .nf
 caustic design flame.png --source plane --mag 3

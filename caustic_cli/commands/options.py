@@ -10,6 +10,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -76,6 +77,12 @@ class Given:
 
     def __init__(self, **values: Any):
         vars(self).update(values)
+        #: What ends with the command.
+        self.held = ExitStack()
+
+    @classmethod
+    def follow(cls, values: dict[str, Any]) -> None:
+        """What all processes but the first do instead of the command if torchrun has started several, with their options."""
 
     @cached_property
     def say(self) -> ConsoleReporter:
@@ -134,15 +141,20 @@ class OnDevice(Debugging):
     ] = None
     threads: Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")] = None
 
-    def start_torch(self, shared: bool = False) -> str:
-        """See `start_torch`.
+    def start_torch(self) -> str:
+        """See `start_torch`; joins the other processes if torchrun has started several."""
+        device = start_torch(self.device, self.threads, self.say)
+        if checks.rank_and_size()[1] > 1:
+            from caustic_cli.optics import ranks  # noqa: PLC0415
 
-        Raises:
-            InputError: torchrun has started several processes, whose work is not `shared`.
-        """
-        if not shared and checks.rank_and_size()[1] > 1:
-            raise InputError("this is done by one process, and torchrun has started more")
-        return start_torch(self.device, self.threads, self.say)
+            self.held.enter_context(ranks.process_group(device))
+        return device
+
+    @classmethod
+    def follow(cls, values: dict[str, Any]) -> None:
+        from caustic_cli.workflow.processes import follow  # noqa: PLC0415
+
+        follow(start_torch(values["device"], values["threads"], ConsoleReporter(True, "auto", False)))
 
 
 class Computation(Presentation, WithProgress, OnDevice):
@@ -213,8 +225,13 @@ def command_of(body: Callable[[Any], None]) -> Callable[..., None]:
             parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name]))
 
     def run(**values):
+        if checks.rank_and_size()[0] > 0:
+            given.follow(values)
+            return
         own = {name: value for name, value in values.items() if name in declared}
-        body(given(**own, **{name: group.read(values) for name, group in groups.items()}))
+        asked = given(**own, **{name: group.read(values) for name, group in groups.items()})
+        with asked.held:
+            body(asked)
 
     run.__signature__ = inspect.Signature(parameters)
     run.__annotations__ = {p.name: p.annotation for p in parameters}

@@ -9,7 +9,6 @@ import typer
 
 from caustic_cli.commands import console, options
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.schema import checks
 
 EXAMPLES = """Examples:
 
@@ -203,7 +202,6 @@ class RenderOptions(TracingOptions, OutputOptions, options.Computation):
 
 def run(asked: RenderOptions) -> None:
     """Trace the lens of PROJECT; write the irradiance image and its figures of merit."""
-    asked.quiet = asked.quiet or checks.rank_and_size()[0] > 0  # of several processes, the first one speaks
     rays, size = None if asked.rays is None else options.rays("--rays", asked.rays), _checked_size(asked)
     given = {path: value for path, value in asked.given.items() if not path.startswith("design.")}  # seed, dtype: of these rays
     if asked.screen_at is not None:
@@ -217,19 +215,11 @@ def run(asked: RenderOptions) -> None:
     refuse_bad_options(given)
     if asked.tolerances is not None:
         schema.read(asked.tolerances)
-    device = asked.start_torch(shared=True)
-
-    from caustic_cli.optics import ranks  # noqa: PLC0415
-
-    with ranks.process_group(device) as rank:
-        if rank > 0:
-            from caustic_cli.workflow.design import follow  # noqa: PLC0415
-
-            follow()
-        elif says_lamp(asked.project):
-            _render_lamp(asked, rays)
-        else:
-            _render_lens(asked, device, rays, size, given)
+    device = asked.start_torch()
+    if says_lamp(asked.project):
+        _render_lamp(asked, rays)
+    else:
+        _render_lens(asked, device, rays, size, given)
 
 
 def _render_lens(asked: RenderOptions, device: str, rays: int | None, size: list[int], given: dict[str, Any]) -> None:

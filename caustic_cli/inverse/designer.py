@@ -219,8 +219,9 @@ class Designer:
         if self._flat(state, stage.tolerance):
             state.reason = "no progress"
             return True
-        asked, late = (ranks.decide(said, self.problem.device) for said in (stop(), time.monotonic() >= deadline))
-        if asked or (state.total >= limit and not ranks.decide(further(), self.problem.device)):
+        decide = partial(ranks.decide, device=self.problem.device)
+        asked, late = decide(stop), decide(lambda: time.monotonic() >= deadline)
+        if asked or (state.total >= limit and not decide(further)):
             state.reason = "interrupted" if asked else "iterations"
             return False
         if late and (state.iteration > 0 or final):
@@ -265,7 +266,8 @@ class Designer:
     def _apart(self, called: Callable[[State], None], state: State) -> None:
         """Call it, outside the clock of the design."""
         before = self._clock()
-        called(state)
+        with ranks.alone():
+            called(state)
         self._origin += self._clock() - before
 
     def objective(self, k: int, heights: Heights) -> LossOfHeights:

@@ -35,6 +35,7 @@ from caustic_cli.inverse.parametrisation import FreeHeights
 from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.surface_from_map import integrate
 from caustic_cli.inverse.transport import corners, solve
+from caustic_cli.optics import ranks
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.gradient.fields import SplineIndex
@@ -255,12 +256,12 @@ class IndexObjective(Objective):
             dtype=torch.float64,
         )
 
-    def _tracers(self) -> Iterator[tuple[int, Tracer]]:
-        """Tracers of the chunks of rays."""
+    def _tracers(self) -> Iterator[tuple[int, Tracer | None]]:
+        """Tracers of the chunks of rays, None for those of other ranks."""
         traced = None
-        for sample in self.samplers[0].chunks(self.chunk):
-            traced = Tracer(self.system, sample, torch.float64, like=traced)
-            yield 0, traced
+        for sample, own in zip(self.samplers[0].chunks(self.chunk), ranks.turns(self.share), strict=False):
+            traced = Tracer(self.system, sample, torch.float64, like=traced) if own else traced
+            yield 0, traced if own else None
 
 
 def transport_index(scene: Scene, target: np.ndarray, control: tuple[int, int], cells: int) -> Tensor:

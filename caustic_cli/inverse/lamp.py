@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from caustic_cli.inverse.mirrors import Mirrors
 from caustic_cli.inverse.parametrisation import InverseLaplacian
 from caustic_cli.inverse.refractor_transport import CELLS, source_directions, transported
 from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.optics import ranks
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.lamp import ChipRays, PointGrid, chip_grids, from_centre, land, least_wall, through, through_point
 from caustic_cli.optics.lamp_side import Roof, inner_side
@@ -66,6 +68,8 @@ FOLD_POINTS, LEAST_AREA, FOLDED = 18_000, 0.2, 0.005
 MEMORY = 100
 #: Iterations of `Aimed`.
 AIMING = 60
+#: Most groups of parts of the rays, each traced by one process.
+GROUPS = 16
 #: Radius of the first inner surface, a sphere, over its least one.
 BEGIN = 4.0 / 3.0
 
@@ -104,34 +108,56 @@ def coarse(image: Tensor) -> Tensor:
     return image.view(n // FINER, FINER, m // FINER, FINER).sum((1, 3))
 
 
-class _InThreads(torch.autograd.Function):
-    """A function of values for several parts, each in a thread of a pool; outputs of all parts one after the other.
+class _Traced(torch.autograd.Function):
+    """Image of all rays of an objective, on the pixels of its screen, and their sums of distance and lack of margin, see `see`.
 
-    The tensors of a part are too small for the threads of one operation.
+    Each part of the rays is traced in a thread, since its tensors are too small for the threads of one operation.  Of several
+    processes each traces some groups of parts, over which sums are taken in their order.
     """
 
     @staticmethod
-    def forward(ctx, values: Tensor, function: Callable[[Any, Tensor], tuple[Tensor, ...]], parts: Sequence[Any], pool: Executor):
-        def one(part: Any) -> tuple[Tensor, tuple[Tensor, ...]]:
+    def forward(ctx, values: Tensor, objective: LampObjective):
+        def trace(part: Any) -> tuple[Tensor, tuple[Tensor, ...]]:
             with torch.set_grad_enabled(wanted):
                 leaf = values.detach().requires_grad_(wanted)
-                return leaf, function(part, leaf)
+                return leaf, objective.see(part, leaf)
+
+        def group(count: int) -> list[Tensor]:
+            done, landed = list(islice(traced, count)), []
+            sums = [torch.zeros_like(objective.target), *torch.zeros(2, dtype=torch.float64)]
+            for _, found in done:
+                landed.append([c.detach().requires_grad_(wanted) for c in found[:3]])
+                with torch.set_grad_enabled(wanted):
+                    sums[0] = sums[0] + objective.splat(*landed[-1], objective.screen, objective.filter)[0]
+                sums[1:] = [total + more.detach() for total, more in zip(sums[1:], found[3:], strict=True)]
+            ctx.groups.append((done, landed, sums[0]))
+            return [c.detach() for c in sums]
 
         wanted = ctx.needs_input_grad[0]
-        ctx.done, ctx.pool = list(pool.map(one, parts)), pool
-        return tuple(c.detach() for _, found in ctx.done for c in found)
+        ctx.of, ctx.groups, ctx.like = objective, [], torch.empty_like(values)
+        traced = objective.pool.map(trace, (part for some in objective.groups for part in some or ()))
+        own = (None if some is None else group(len(some)) for some in objective.groups)
+        zero = torch.zeros((), dtype=torch.float64)
+        total = [torch.zeros_like(objective.target), zero.clone(), zero.clone()]
+        for more in ranks.in_order(own, [objective.target, zero, zero], objective.share):
+            total = [c + m for c, m in zip(total, more, strict=True)]
+        return tuple(total)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *given):
-        each = len(given) // len(ctx.done)
-
-        def one(k: int) -> Tensor:
-            leaf, found = ctx.done[k]
-            pairs = [(c, g) for c, g in zip(found, given[k * each : (k + 1) * each], strict=True) if c.requires_grad]
+    def backward(ctx, by_image, *by_sums):
+        def pull(traced: tuple[tuple[Tensor, tuple[Tensor, ...]], Sequence[Tensor]]) -> Tensor:
+            (leaf, found), by = traced
+            pairs = [(c, g) for c, g in zip(found, (*by, *by_sums), strict=True) if c.requires_grad]
             return torch.autograd.grad([c for c, _ in pairs], leaf, [g for _, g in pairs])[0]
 
-        return sum(ctx.pool.map(one, range(len(ctx.done)))), None, None, None
+        parts = []
+        for done, landed, image in ctx.groups:
+            by = torch.autograd.grad(image, [c for three in landed for c in three], by_image)
+            parts += list(zip(done, (by[k : k + 3] for k in range(0, len(by), 3)), strict=True))
+        pulled = ctx.of.pool.map(pull, parts)
+        own = (None if some is None else [sum(islice(pulled, len(some)))] for some in ctx.of.groups)
+        return sum(more for (more,) in ranks.in_order(own, [ctx.like], ctx.of.share)), None
 
 
 class LampObjective:
@@ -149,13 +175,19 @@ class LampObjective:
     def __init__(self, lamp: Lamp, goal: Goal, field: PolarField, target: Tensor, rays: int, weight: float = 0.1, threads: int = 1):
         point, shape = lamp.chip.shape == "point", (target.shape[0], target.shape[1])
         self.goal, self.weight = goal, weight if point else weight * lamp.blur(goal) / lamp.border(goal)
-        self.rays: Sequence[PointGrid | ChipRays]
         self.mirrors = Mirrors.of(lamp, goal, target)
-        self.rays = (
+        parts: Sequence[PointGrid | ChipRays] = (
             PointGrid.of(field, rays, lamp.chip, self.mirrors, shape[0] / shape[1])
             if point
             else list(chip_grids(lamp.chip, CHIP_POINTS, rays, self.mirrors))
         )
+        #: Rank of this process and number of those among which groups of parts of the rays are dealt out, and these groups, None
+        #: for those of other ranks.
+        self.share, each = ranks.rank_and_size(), math.ceil(len(parts) / GROUPS)
+        self.groups = [
+            parts[k : k + each] if own else None
+            for k, own in zip(range(0, len(parts), each), ranks.turns(self.share), strict=False)
+        ]
         self.pool = ThreadPoolExecutor(threads)
         self.through = partial(through_point if point else through, lamp, field)
         apron, self.filter = FINER * APRON, NARROW if point and rays >= ENOUGH * target.numel() else WIDE
@@ -183,15 +215,12 @@ class LampObjective:
 
     def terms(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """rho^2, efficiency, mean distance beside the target, and lack of margin."""
-        found = _InThreads.apply(values, self._see, self.rays, self.pool)
-        image, distance, lack = torch.zeros_like(self.target), sum(found[3::5]), sum(found[4::5])
-        for x, y, power in zip(found[::5], found[1::5], found[2::5], strict=True):
-            image = image + self.splat(x, y, power, self.screen, self.filter)[0]
+        image, distance, lack = _Traced.apply(values, self)
         image = self.mirrors.whole(image)
         residual = self.over(image / (image * self.seen).sum() - self.target)
         return (self.weights * residual**2).sum(), (image * self.inside).sum(), distance, lack
 
-    def _see(self, rays, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def see(self, rays, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Where some rays land, x, y, mm, and with what power, and their contributions to the distance beside the target and to the
         lack of margin."""
         light = self.through(rays, values)
@@ -405,6 +434,19 @@ def judged_pixels(lamp: Lamp, goal: Goal, effort: Effort) -> tuple[int, int]:
     return 2 * across, 2 * along
 
 
+def first_lamp(lamp: Lamp, goal: Goal, picture: np.ndarray, effort: Effort) -> tuple[int, PolarField, Tensor]:
+    """The lamp before the first stage, `begun` of `design_lamp`.
+
+    Raises:
+        InputError: the picture is black, or the surfaces come too near to each other.
+    """
+    stages = stages_of(lamp, effort)
+    field = field_of(effort, stages[0][1][0] if stages else None)
+    values = initial_lamp(lamp, goal, field, picture, effort.lamp_cells)
+    refuse_thin(lamp, field, values)
+    return 0, field, values
+
+
 def design_lamp(
     lamp: Lamp,
     goal: Goal,
@@ -429,13 +471,7 @@ def design_lamp(
     Raises:
         InputError: the picture is black, or the surfaces come too near to each other.
     """
-    stages = stages_of(lamp, effort)
-    if begun is None:
-        field = field_of(effort, stages[0][1][0] if stages else None)
-        values = initial_lamp(lamp, goal, field, picture, effort.lamp_cells)
-        refuse_thin(lamp, field, values)
-        begun = 0, field, values
-    first, field, values = begun
+    stages, (first, field, values) = stages_of(lamp, effort), begun or first_lamp(lamp, goal, picture, effort)
     for k, (designed, (pixels, rays, iterations, weight)) in list(enumerate(stages))[first:]:
         coarser, field = field, field_of(effort, pixels)
         values = refined(coarser, values, field)

@@ -2,19 +2,22 @@
 
     L = (sum over k of w_k L_k^p)^(1 / p),    sum of w_k = 1
 
-L_k is a function of the section of the design's heights that belongs to member k, from which it may depart by a constant.
+L_k is a function of the section of the design's heights that belongs to member k, from which it may depart by a constant.  Of
+several processes each evaluates some of the members, whose objectives are therefore made while it works `alone` (`ranks`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import EllipsisType
 
 import torch
 from torch import Tensor
 
 from caustic_cli.inverse.objective import Evaluation, LossOfHeights
+from caustic_cli.optics import ranks
 from caustic_cli.optics.system import EXIT
 
 
@@ -44,7 +47,7 @@ class Mixture:
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value, gradient, fraction of the light on the screen and image at heights mm float64."""
-        found = [member.objective(heights[member.where] + member.added) for member in self.members]
+        found = ranks.divided([partial(member.objective, heights[member.where] + member.added) for member in self.members])
         loss = sum(member.weight * e.loss**self.power for member, e in zip(self.members, found, strict=True)) ** (1.0 / self.power)
         gradient = found[0].gradient.new_zeros(heights.shape)
         for member, e in zip(self.members, found, strict=True):

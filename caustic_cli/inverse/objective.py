@@ -13,7 +13,6 @@ depend on the heights (basis matrices, filtered target, blur) is made once.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, cast
@@ -33,7 +32,7 @@ from caustic_cli.optics.memory import smaller_chunk
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
-from caustic_cli.optics.trace import Parameters, Tracer, is_by_rows, tracers
+from caustic_cli.optics.trace import Parameters, Tracer, dealt_tracers, is_by_rows
 from caustic_cli.scene import Scene, Screen
 
 if TYPE_CHECKING:
@@ -195,6 +194,8 @@ class Objective:
         self.penalty = penalty_of(scene, field, loss, limits or Limits(), self.device)
         self.scene, self.field, self.dtype, self.blur = scene, field, dtype, blur
         self.chunk, self.kept, kept = CHUNK, None, KEPT_RAYS
+        #: Rank of this process and number of those among which the chunks of rays are dealt out.
+        self.share = ranks.rank_and_size()
         try:
             if self._rows():
                 self.chunk, kept = CHUNK_OF_ROWS, KEPT_OF_ROWS
@@ -216,7 +217,9 @@ class Objective:
     def keeps_graphs(self) -> bool:
         """Whether the graphs of all chunks are kept: a fused kernel stores the net or the surface at its rays, a staged trace every
         ray after each stage."""
-        return self.kept is not None and (sum(t.fused is None for _, t in self.kept) <= self.graphs)
+        if self.kept is None:
+            return False
+        return len(self.kept) <= self.graphs or all(traced is None or traced.fused is not None for _, traced in self.kept)
 
     def _rows(self) -> bool:
         """Whether the rays are a tensor grid on the exit, for which there is a fused kernel."""
@@ -224,12 +227,11 @@ class Objective:
             return False
         return all(is_by_rows(self.scene, self.field, s, self.scene.screen) for s in self.samplers)
 
-    def _tracers(self) -> Iterator[tuple[int, Tracer]]:
-        """Tracers of the chunks of this rank, each with the index of its source point."""
-        rank, count = ranks.rank_and_size()
+    def _tracers(self) -> Iterator[tuple[int, Tracer | None]]:
+        """Tracers of all chunks, None for those of other ranks, each with the index of its source point."""
+        own = ranks.turns(self.share)
         for k, sampler in enumerate(self.samplers):
-            size = min(self.chunk, math.ceil(sampler.count / count)) if count > 1 else self.chunk
-            for traced in tracers(self.scene, self.field, sampler, self.dtype, size, share=(rank, count)):
+            for traced in dealt_tracers(self.scene, self.field, sampler, self.dtype, self.chunk, own=own):
                 yield k, traced
 
     def __call__(self, heights: Tensor) -> Evaluation:
@@ -250,7 +252,7 @@ class Objective:
             try:
                 return self._evaluate(parameters)
             except (MemoryError, RuntimeError) as error:
-                if ranks.rank_and_size()[1] > 1:  # the other ranks wait for the image of this chunk
+                if self.share[1] > 1:  # the other ranks wait for the image of this chunk
                     raise
                 problem = error.with_traceback(None)  # the traceback would keep all allocations alive
             self.chunk, self.kept = smaller_chunk(self.chunk, problem), None
@@ -263,7 +265,6 @@ class Objective:
         leaves = list(parameters.values())
         penalty = self._penalty(parameters) if self.penalty else torch.zeros((), device=self.device)
         sums, entering, contributions = self._sums(parameters)
-        ranks.all_reduce(*sums, entering)
         for value in sums:
             value.requires_grad_()
         seen = [self.blur.spread_out(images) for images in sums[: len(self.channels)]]
@@ -272,36 +273,49 @@ class Objective:
         derivatives = torch.autograd.grad(loss, wanted, allow_unused=True)
         by, direct = derivatives[: len(sums)], derivatives[len(sums) :] or (None,) * len(leaves)
         gradients = [torch.zeros_like(heights) for heights in leaves]
-        for k, contribution in contributions or ((k, self._see(traced, parameters)) for k, traced in self.kept or self._tracers()):
-            # Bincount images, and the power that leaves a lens without reflections, do not depend on the heights.
-            pulls = [
-                (value, pull.to(value.dtype))
-                for value, pull in zip(contribution, self._of_point(by, k), strict=True)
-                if pull is not None and value.requires_grad
-            ]
-            if pulls:
-                values, pulled = zip(*pulls, strict=True)
-                _add(gradients, torch.autograd.grad(values, leaves, pulled, allow_unused=True))
-        ranks.all_reduce(*gradients)
+        graphs = contributions or ((k, traced and self._see(traced, parameters)) for k, traced in self.kept or self._tracers())
+        pulled = (found and self._pulled(found, self._of_point(by, k), leaves) for k, found in graphs)
+        for more in ranks.in_order(pulled, gradients, self.share):
+            _add(gradients, more)
         _add(gradients, direct)
         inner = self.channels[0].inner(seen[0].detach())
         return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()), inner)
 
-    def _sums(self, parameters: Parameters) -> tuple[list[Tensor], Tensor, list[tuple[int, list[Tensor]]]]:
+    def _sums(self, parameters: Parameters) -> tuple[list[Tensor], Tensor, list[tuple[int, list[Tensor] | None]]]:
         """Accumulated contributions of all chunks, see `_see`, images with an axis of source points in front; the power that
         enters; and the contributions with their graphs, where these are kept."""
         zero = torch.zeros(self.channels[0].shape[:-2], dtype=torch.float64, device=self.device)  # one for each colour
         sums = [zero.new_zeros(len(self.samplers), *channel.shape) for channel in self.channels]
         sums += [zero.clone() for _ in range(1 + self.further)]
-        entering, contributions = zero.clone(), []
-        with torch.set_grad_enabled(self.keeps_graphs):
+        entering, contributions, points = zero.clone(), [], []
+
+        def seen() -> Iterator[list[Tensor] | None]:
             for k, traced in self.kept or self._tracers():
-                contribution = self._see(traced, parameters)
-                _add(self._of_point(sums, k), [more.detach() for more in contribution])
-                entering = entering + traced.entering.double()
+                found = traced and self._see(traced, parameters)
+                points.append(k)
                 if self.keeps_graphs:
-                    contributions.append((k, contribution))
+                    contributions.append((k, found))
+                yield found and [*(more.detach() for more in found), traced.entering.double()]
+
+        with torch.set_grad_enabled(self.keeps_graphs):
+            for n, found in enumerate(ranks.in_order(seen(), [*self._of_point(sums, 0), entering], self.share)):
+                _add(self._of_point(sums, points[n]), found[:-1])
+                entering = entering + found[-1]
         return sums, entering, contributions
+
+    @staticmethod
+    def _pulled(contribution: list[Tensor], by: Sequence[Tensor | None], leaves: list[Tensor]) -> Sequence[Tensor | None]:
+        """Derivatives by the leaves, None for zero, from those by a contribution."""
+        # Bincount images, and the power that leaves a lens without reflections, do not depend on the heights.
+        pulls = [
+            (value, pull.to(value.dtype))
+            for value, pull in zip(contribution, by, strict=True)
+            if pull is not None and value.requires_grad
+        ]
+        if not pulls:
+            return [None] * len(leaves)
+        values, pulled = zip(*pulls, strict=True)
+        return torch.autograd.grad(values, leaves, pulled, allow_unused=True)
 
     def _of_point(self, values: Sequence[Tensor], k: int) -> list[Tensor]:
         """Of accumulated values, or their derivatives, which may be None, those of source point k."""

@@ -50,8 +50,9 @@ class Contribution:
     mode: int
     #: Number of the wavefront, which parts with the same rays share.
     front: int
-    exposure: Any
-    power: float
+    #: None of another rank's.
+    exposure: Any = None
+    power: float = 0.0
 
 
 class WaveObjective:
@@ -91,30 +92,42 @@ class WaveObjective:
         self.loss = (Loss if target.ndim == 2 else ColorLoss)(loss, wide, how.blur, how.apron, wide > 0, how.bright)
         self.penalty = penalty_of(scene, field, loss, limits or Limits(), device)
         lines = lines_of(scene, field, None if scene.light.continuum is None else wavelengths or None)
-        rank, count = ranks.rank_and_size()
+        #: Rank of this process and number of those among which the wavefronts are dealt out.
+        self.share = ranks.rank_and_size()
         parameters = {EXIT: self.middle}
         with torch.no_grad():
             receiver = receiver_of(lines[0].system, screen)
             finer = 1.0 if self.loss.box is None else FINER
             self.imager = Imager.of(lines, parameters, receiver, finer, watched=_lit(scene, target), dense=True)
-            self.changes: list[Any] = []
-            self.fronts: list[Wavefront] = []
-            self.parts = list(self._parts(lines[rank::count], parameters))
+            #: The wavefronts with the changes of their optical paths by the heights, by number; those of other ranks are missing.
+            self.fronts: dict[int, tuple[Wavefront, Any]] = {}
+            self.parts = list(self._parts(lines, parameters))
+            self.numbers = sorted({part.front for part in self.parts})
         self.in_colour = lines[0].colour is not None
         self.colours = len({line.channel for line in lines if line.channel is not None})
-        self.keeps = len(self.parts) * 8 * self.imager.sampling.samples <= KEPT
+        self.keeps = sum(self._is_own(part.front) for part in self.parts) * 8 * self.imager.sampling.samples <= KEPT
 
     def _parts(self, lines: list[Line], parameters) -> Iterator[Contribution]:
-        imager, made, backend = self.imager, dict[tuple, tuple[int, Wavefront]](), backend_for(self.middle.device)
+        """All contributions, without an exposure those of other ranks."""
+        imager, numbers, backend = self.imager, dict[tuple, int](), backend_for(self.middle.device)
+        one_index = len({(id(line.system), line.label) for line in lines}) == 1  # for `image_at`, which rank 0 asks for
         for line in lines:
             for k, mode in enumerate(imager.modes(line.system)):
-                key = id(line.system), line.label, k
-                if key not in made:  # wavelengths of the same index have the same rays
-                    made[key] = len(made), imager.front(line, mode, parameters, sensitive=True)
-                    self.changes.append(backend.path_change(self.field, made[key][1].last, self.dtype))
-                    self.fronts.append(made[key][1])
-                number, front = made[key]
-                yield Contribution(line, k, number, self._exposure(line, front), front.power)
+                # wavelengths of the same index have the same rays
+                number = numbers.setdefault((id(line.system), line.label, k), len(numbers))
+                own = self._is_own(number)
+                if number not in self.fronts and (own or (one_index and self.share[0] == 0)):
+                    front = imager.front(line, mode, parameters, sensitive=True)
+                    self.fronts[number] = front, backend.path_change(self.field, front.last, self.dtype)
+                if own:
+                    front = self.fronts[number][0]
+                    yield Contribution(line, k, number, self._exposure(line, front), front.power)
+                else:
+                    yield Contribution(line, k, number)
+
+    def _is_own(self, front: int) -> bool:
+        """Whether a wavefront is this rank's."""
+        return front % self.share[1] == self.share[0]
 
     def _exposure(self, line: Line, front: Wavefront) -> Any:
         """The image of a contribution; only that part of it which the loss looks at, where this is faster."""
@@ -135,18 +148,18 @@ class WaveObjective:
         ranks.broadcast(heights)
         heights.requires_grad_()
         penalty = self.penalty(heights) if self.penalty else torch.zeros((), dtype=torch.float64, device=heights.device)
-        changes = [change.of(heights.detach() - self.middle) for change in self.changes]
+        moved = heights.detach() - self.middle
+        changes = {number: change.of(moved) for number, (_, change) in self.fronts.items() if self._is_own(number)}
         shape = (3, *self.loss.target.shape) if self.colours else self.loss.target.shape
         image = torch.zeros(shape, dtype=torch.float64, device=heights.device)
         leaving = image.new_zeros(image.shape[:-2])
         xyz = image.new_zeros(3, *image.shape) if self.in_colour else image.new_zeros(0)
-        for part in self.parts:
-            found = self.imager.spread_out(part.exposure.image(changes[part.front], self.keeps), part.mode)
-            power = part.line.part * found.double()
+        one = image.new_zeros(self.loss.target.shape[-2:])
+        owners, own = [part.front for part in self.parts], (self._image(part, changes) for part in self.parts)
+        for part, (power, passed) in zip(self.parts, ranks.in_order(own, [one, one.sum()], self.share, owners), strict=True):
             self._channel(image, part)[...] += power
             xyz += with_colour(None, power, part.line.colour) if self.in_colour else 0.0
-            self._channel(leaving, part)[...] += part.line.part * part.power
-        ranks.all_reduce(image, leaving, xyz)
+            self._channel(leaving, part)[...] += passed
         image.requires_grad_()
         loss = self.loss(image, leaving, penalty)
         by_image, direct = (
@@ -154,14 +167,15 @@ class WaveObjective:
             if penalty.requires_grad
             else (*torch.autograd.grad(loss, (image,)), None)
         )
-        by_changes = [torch.zeros_like(change) for change in changes]
+        by_changes = {number: torch.zeros_like(change) for number, change in changes.items()}
         for part in self.parts:
-            pull = self.imager.gathered(part.line.part * self._channel(by_image, part), part.mode, part.exposure.resolution)
-            part.exposure.pull(pull, changes[part.front], by_changes[part.front])
+            if part.exposure is not None:
+                pull = self.imager.gathered(part.line.part * self._channel(by_image, part), part.mode, part.exposure.resolution)
+                part.exposure.pull(pull, changes[part.front], by_changes[part.front])
         gradient = torch.zeros_like(heights)
-        for change, by in zip(self.changes, by_changes, strict=True):
-            gradient += change.pull(by)
-        ranks.all_reduce(gradient)
+        pulled = ([self.fronts[k][1].pull(by_changes[k])] if k in by_changes else None for k in self.numbers)
+        for (more,) in ranks.in_order(pulled, [gradient], self.share):
+            gradient += more
         if direct is not None:
             gradient = gradient + direct
         a = self.apron
@@ -169,6 +183,13 @@ class WaveObjective:
             c[..., a : image.shape[-2] - a, a : image.shape[-1] - a] for c in (image.detach(), xyz if len(xyz) else image)
         )
         return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()), shown.detach())
+
+    def _image(self, part: Contribution, changes: dict[int, Tensor]) -> list[Tensor] | None:
+        """Power of a part on the pixels, and in all; None of another rank's."""
+        if part.exposure is None:
+            return None
+        found = self.imager.spread_out(part.exposure.image(changes[part.front], self.keeps), part.mode)
+        return [part.line.part * found.double(), torch.tensor(part.line.part * part.power, dtype=torch.float64)]
 
     @torch.no_grad()
     def image_at(self, heights: Tensor, wavelengths: tuple[float, ...]) -> Tensor | None:
@@ -178,7 +199,7 @@ class WaveObjective:
         if self.colours or len(modes) != len(self.fronts) or len({(id(line.system), line.label) for line in lines}) > 1:
             return None
         image = torch.zeros(self.loss.target.shape, dtype=torch.float64, device=self.middle.device)
-        for k, (front, change) in enumerate(zip(self.fronts, self.changes, strict=True)):
+        for k, (front, change) in self.fronts.items():
             changed = change.of(heights.detach().to(self.middle) - self.middle)
             for line in lines:
                 found = self._exposure(line, front).image(changed)

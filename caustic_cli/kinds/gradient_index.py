@@ -26,6 +26,7 @@ from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.surface import Described, OneSurface
 from caustic_cli.loading import OnDemand
+from caustic_cli.optics import ranks
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.scene import Scene
 from caustic_cli.scene.gradient import Gradient
@@ -128,9 +129,10 @@ class IndexPlate(OneSurface):
             now.total = now.iteration = state.total + k
             now.seconds, now.image = before + time.monotonic() - began, image
             now.history.append((now.total, 0, loss, on_screen, now.seconds))
-            on_iteration(now)
+            with ranks.alone():
+                on_iteration(now)
 
-        values = self.search(lens, state, now, max(0, total - state.total), done, lambda: stop() or late())
+        values = self.search(lens, state, now, max(0, total - state.total), done, lambda: ranks.decide(lambda: stop() or late()))
         if stop():
             now.reason = "interrupted"
         elif now.total >= total:

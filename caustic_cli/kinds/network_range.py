@@ -19,6 +19,7 @@ from caustic_cli.inverse.scene_parameters import Range, Ranges
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.elements import AmongElements
 from caustic_cli.kinds.surface import DEFAULT_SPANS, Described, OneSurface
+from caustic_cli.optics import ranks
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import retrace
@@ -81,7 +82,8 @@ class NetworkOverRange(OneSurface):
 
     def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         stage = self.stages[k]
-        middle = self.on_rays(scene, k, self.field(k), self.target, stage.rays)
+        with ranks.alone():
+            middle = self.on_rays(scene, k, self.field(k), self.target, stage.rays)
         return RangeObjective(
             middle, self.ranges, lambda s, seed: rays_of(s, stage.sampler, stage.rays, seed, self.device), self.seed(k)
         )

@@ -13,6 +13,7 @@ from caustic_cli.kinds.elements import AmongElements, FreeElements
 from caustic_cli.kinds.lenslet_array import LensletArray
 from caustic_cli.kinds.surface import Described, OneSurface
 from caustic_cli.kinds.two_sided import TwoSides
+from caustic_cli.optics import ranks
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.section import content
 from caustic_cli.scene.tolerances import Tolerances
@@ -46,9 +47,10 @@ class RobustSurface(OneSurface):
     def objective(self, k: int, initial: Tensor) -> LossOfHeights:
         if k < len(self.stages) - 1:
             return super().objective(k, initial)
-        return robust_objective(
-            lambda scene, heights: self.objective_in(scene, k, heights), self.scene, self.field(k), initial, self.tolerances
-        )
+        with ranks.alone():
+            return robust_objective(
+                lambda scene, heights: self.objective_in(scene, k, heights), self.scene, self.field(k), initial, self.tolerances
+            )
 
 
 class RobustAmongElements(RobustSurface, AmongElements):

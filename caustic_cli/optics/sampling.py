@@ -189,22 +189,19 @@ class Sampler:
         """Whether its samples have tensor-product structure."""
         return self.kind in TENSOR
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample]:
-        """The rays in order, at most about `size` at a time; fluxes over all chunks sum to 1.
-
-        With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
-        """
+    def chunks(self, size: int = 1 << 20) -> Iterator[Sample]:
+        """The rays in order, at most about `size` at a time; fluxes over all chunks sum to 1."""
         norm, even = 1.0 / self.count, self.profile is None and not self.aperture.round
         if not even:
             total = sum(float(self._irradiance(s).sum()) for s in self._points(size))
             if not total > 0:
                 raise InputError("⟨source.profile⟩: it is black at every sampled point; use more rays")
             norm = 1.0 / total
-        for s in self._points(size, first, step):
+        for s in self._points(size):
             flux = torch.tensor(norm, dtype=torch.float64) if even else norm * self._irradiance(s)
             yield Sample(s.u, s.v, s.tensor, flux.to(self.device))
 
-    def _points(self, size: int, first: int = 0, step: int = 1) -> Iterator[Sample]:
+    def _points(self, size: int) -> Iterator[Sample]:
         nu, nv = self.shape
         one = torch.ones((), dtype=torch.float64)
         if self.tensor:
@@ -214,10 +211,10 @@ class Sampler:
                 du, dv = random_numbers(self.seed, 0, i), random_numbers(self.seed, 1, j)
             u, v = (i + du) / nu, (j + dv) / nv  # du, dv are float64
             rows = max(1, size // nv)
-            for a in range(first * rows, nu, step * rows):
+            for a in range(0, nu, rows):
                 yield Sample(u[a : a + rows], v, True, one)
             return
-        for a in range(first * size, self.count, step * size):
+        for a in range(0, self.count, size):
             u, v = numbers(self.kind, self.shape, self.seed, 2, a, min(a + size, self.count), self.device)
             yield Sample(u, v, False, one)
 

@@ -23,6 +23,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import repeat
 from types import MappingProxyType
 from typing import cast
 
@@ -406,27 +407,40 @@ def tracers(
     dtype: torch.dtype,
     chunk: int,
     requests: Requests = NO_REQUESTS,
-    share: tuple[int, int] = (0, 1),
     **options,
 ) -> Iterator[Tracer]:
-    """Tracers of all rays of a sampler through a scene, chunk by chunk, band by band.
+    """Tracers of all rays of a sampler through a scene, chunk by chunk, band by band."""
+    return (made for made in dealt_tracers(scene, field, sampler, dtype, chunk, requests, **options) if made is not None)
 
-    share: (k, n) takes every n-th chunk from number k on, the share of one of n processes.
-    """
-    bands = scene.bands
-    for band in bands:
+
+def dealt_tracers(
+    scene: Scene,
+    field: HeightField,
+    sampler: Rays,
+    dtype: torch.dtype,
+    chunk: int,
+    requests: Requests = NO_REQUESTS,
+    own: Iterator[bool] | None = None,
+    **options,
+) -> Iterator[Tracer | None]:
+    """The same, with None for chunks that are not this process's own, of which one item is taken for each chunk."""
+    mine = repeat(True) if own is None else own
+    for band in scene.bands:
         system, traced = System.of(band.scene, field), None
-        for rays in _chunks(of_member(sampler, band.member), chunk, share):
+        for rays, wanted in zip(_chunks(of_member(sampler, band.member), chunk), mine, strict=False):
+            if not wanted:
+                yield None
+                continue
             traced = Tracer(system, rays, dtype, requests, traced, weight=band.weight, channel=band.channel, **options)
             traced.colour = band.colour
             yield traced
 
 
-def _chunks(sampler: Rays, size: int, share: tuple[int, int]) -> Iterator[Sample | RayState | Bundle]:
+def _chunks(sampler: Rays, size: int) -> Iterator[Sample | RayState | Bundle]:
     """The rays of a sampler, as pencils where they are."""
     if isinstance(sampler, Emission) and sampler.homocentric:
-        return sampler.pencils(size, *share)
-    return sampler.chunks(size, *share)
+        return sampler.pencils(size)
+    return sampler.chunks(size)
 
 
 def expose(

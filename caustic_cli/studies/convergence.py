@@ -76,7 +76,7 @@ def run_study(
         dtype: precision of the rays studied, None for float64 (`precision` always compares both).
         max_rays: rays of the largest setting, None for MAX_RAYS; the reference uses many times more.
         repeats: rounds, each with fresh rays.
-        progress: called with (rays traced, rays in total) after every image.
+        progress: called with (rays traced, rays in total) after every round.
 
     Raises:
         InputError: unknown study, or numbers out of range.
@@ -175,8 +175,7 @@ def study_precision(bench: Benchmark, _dtype) -> Study:
         difference = relative_rms(image, before) if s.dtype == torch.float32 else None
         return {"error": truth.error_of(image), "difference": difference}
 
-    with plain():
-        rows = bench.measure(settings, figures)
+    rows = bench.measure(settings, figures, plain)
     for double, single in zip(rows[::2], rows[1::2], strict=True):
         double |= {"dtype": "float64", "speedup": None}
         single |= {"dtype": "float32", "speedup": double["seconds"] / single["seconds"]}

@@ -17,12 +17,15 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from itertools import groupby
 
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.optics import ranks
 from caustic_cli.optics.resolution import GREEN, Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
@@ -44,6 +47,8 @@ A_PIXEL = 64
 #: Largest error at which the ray image counts as sufficient.
 ENOUGH = 0.1
 
+#: Series, value, wavelength, nm, full angle of the source, degrees, and scale of the lens.
+Case = tuple[str, float, float, float, float]
 COLUMNS = {
     "series": "parameter varied",
     "value": "lens size (mm), wavelength (nm) or the source's full angle (degrees)",
@@ -91,27 +96,10 @@ def run_diffraction(
     own = plane.lens.size[0]
     cases = _cases(own)
     count = rays or A_PIXEL * math.prod(plane.screen.resolution)
-    rows, drawn = [], {}
-    for k, (series, value, wavelength, angle, factor) in enumerate(cases):
-        one, net, lifted = scaled(plane, field, heights.detach().double(), factor)
-        if angle:
-            one = replace(one, source=Disc(power=plane.source.power, angle=angle, tilt=plane.source.tilt))
-        key = factor, angle
-        if key not in drawn:
-            drawn = {key: _rays(one, net, lifted, count, seed)}
-        reference, ray_seconds = drawn[key]
-        began = time.perf_counter()
-        try:
-            light = wave_image(one, net, lifted, wavelengths=(wavelength,), dtype=dtype or torch.float32)
-        except NoWaveImage:
-            continue
-        seconds = time.perf_counter() - began
-        seen = Resolution.at(replace(one, light=Light(None, (wavelength,))), net, lifted)
-        error, blur = reference.error_of(light.image.cpu()), seen.blur / seen.pixel
-        found = (series, value, error, reference.error, blur, seconds, ray_seconds, max(light.samples))
-        rows.append(dict(zip(COLUMNS, found, strict=True)))
-        if progress is not None:
-            progress(k + 1, len(cases))
+    groups = [list(group) for _, group in groupby(cases, lambda case: case[3:])]
+    measured = partial(_measured, plane, field, heights.detach().double(), count, seed, dtype or torch.float32)
+    told = (lambda done: None) if progress is None else lambda done: progress(done, len(groups))
+    rows = [row for some in ranks.mapped(measured, groups, told) for row in some]
     if not rows:
         raise NoWaveImage("this lens has no wave image at any of the sizes, wavelengths and sources of the study")
     about = {
@@ -128,13 +116,36 @@ def run_diffraction(
     return Study("diffraction", COLUMNS, rows, {}, _advice(rows), about, "value", PLOTS)
 
 
-def _cases(own: float) -> list[tuple[str, float, float, float, float]]:
+def _cases(own: float) -> list[Case]:
     """Series, value, wavelength, nm, full angle of the source, degrees, and scale of a lens of this size, mm."""
     return [
         *(("lens size", size, GREEN, 0.0, size / own) for size in SIZES),
         *(("wavelength", wavelength, wavelength, 0.0, 1.0) for wavelength in WAVELENGTHS),
         *(("source size", angle, GREEN, angle, 1.0) for angle in ANGLES),
     ]
+
+
+def _measured(
+    plane: Scene, field: HeightField, heights: Tensor, rays: int, seed: int, dtype: torch.dtype, cases: list[Case]
+) -> list[dict]:
+    """Rows of cases that differ in the wavelength alone, and so have the same ray image; without those that have no wave image."""
+    *_, angle, factor = cases[0]
+    one, net, lifted = scaled(plane, field, heights, factor)
+    if angle:
+        one = replace(one, source=Disc(power=plane.source.power, angle=angle, tilt=plane.source.tilt))
+    rows, (reference, ray_seconds) = [], _rays(one, net, lifted, rays, seed)
+    for series, value, wavelength, *_ in cases:
+        began = time.perf_counter()
+        try:
+            light = wave_image(one, net, lifted, wavelengths=(wavelength,), dtype=dtype)
+        except NoWaveImage:
+            continue
+        seconds = time.perf_counter() - began
+        seen = Resolution.at(replace(one, light=Light(None, (wavelength,))), net, lifted)
+        error, blur = reference.error_of(light.image.cpu()), seen.blur / seen.pixel
+        found = (series, value, error, reference.error, blur, seconds, ray_seconds, max(light.samples))
+        rows.append(dict(zip(COLUMNS, found, strict=True)))
+    return rows
 
 
 def _rays(scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int) -> tuple[Reference, float]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import torch
 from matplotlib.figure import Figure
@@ -23,7 +24,8 @@ from torch import Tensor
 from caustic_cli import __version__
 from caustic_cli.effort import STANDARD, Effort, current_effort
 from caustic_cli.errors import InputError
-from caustic_cli.optics.effects import EFFECTS, Decision, Requests
+from caustic_cli.optics import ranks
+from caustic_cli.optics.effects import EFFECTS, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.plan import Plan, compile_plan
@@ -228,13 +230,10 @@ def run_effects(
         for usual in (effort.effect_rounds, effort.wave_rounds)
     ]
     heights = heights.detach().double()
-    plan, rows = compile_plan(scene, field, heights), []
-    for k, effect in enumerate(plan.effects):
-        found = _row(effect, plan, scene, field, heights, rays, rounds[WAVES[effect.name]], seed, dtype or torch.float64)
-        if found is not None:
-            rows.append(found)
-        if progress is not None:
-            progress(k + 1, len(EFFECTS))
+    plan = compile_plan(scene, field, heights)
+    measured = partial(_row, plan, scene, field, heights, rays, rounds, seed, dtype or torch.float64)
+    told = (lambda done: None) if progress is None else lambda done: progress(done, len(EFFECTS))
+    rows = [row for row in ranks.mapped(measured, range(len(plan.effects)), told) if row is not None]
     told = sorted((r for r in rows if r["on"]), key=_influence, reverse=True)
     advice = (
         f"of what this scene has, {told[0]['series']} matters most ({_influence(told[0]):.2g})"
@@ -263,17 +262,20 @@ def _influence(row: dict) -> float:
 
 
 def _row(
-    effect: Decision,
     plan: Plan,
     scene: Scene,
     field: HeightField,
     heights: Tensor,
     rays: int,
-    repeats: int,
+    rounds: list[int],
     seed: int,
     dtype: torch.dtype,
+    number: int,
 ) -> dict | None:
-    name, amount, bare = effect.name, OWN, None
+    """The row of an effect of the plan by its number, None for one that this scene cannot have; rounds: of effects in the ray image
+    and in the wave image."""
+    effect = plan.effects[number]
+    name, amount, bare, repeats = effect.name, OWN, None, rounds[WAVES[effect.name]]
     if not effect.present:
         try:
             made = None if BY_NAME[name].of_glass and scene.lens.mirror else BY_NAME[name].probe(scene, heights)

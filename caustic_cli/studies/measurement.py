@@ -18,18 +18,24 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from caustic_cli.errors import CausticError
+from caustic_cli.optics import ranks
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms
+
+R = TypeVar("R")
 
 #: Rays of a reference over those of the largest setting: an error of order 3/4 falls to an eighth, so the correction in quadrature
 #: is about one per cent.
@@ -80,7 +86,7 @@ class Benchmark:
         seed: of the rays of the first round; each round takes the next one.
         repeats: rounds.
         max_rays: rays of the largest setting.
-        progress: called with (rays traced, rays in total) after every image, or None.
+        progress: called with (rays traced, rays in total) after every round, or None.
     """
 
     scene: Scene
@@ -114,10 +120,8 @@ class Benchmark:
             CausticError: no light reaches the screen.
         """
         half = Setting("reference", "stratified", REFERENCE_FACTOR * self.max_rays // 2, filter, torch.float64)
-        images = []
-        for k in (0, 1):
-            images.append(self.image(half, self.seed + REFERENCE_SEED + k))
-            self._tick(half.rays)
+        seeds = [self.seed + REFERENCE_SEED + k for k in (0, 1)]
+        images = self._mapped(partial(_image, self, half), seeds, half.rays)
         if not all(float(image.sum()) > 0 for image in images):
             raise CausticError(
                 "no light reaches the screen, so there is no image to study: every ray is reflected"
@@ -125,24 +129,27 @@ class Benchmark:
             )
         return Reference(sum(images) / 2.0, 2 * self.sampler(half, 0).count, relative_rms(*images) / 2.0)
 
-    def measure(self, settings: Sequence[Setting], figures: Figures) -> list[dict]:
+    def measure(
+        self, settings: Sequence[Setting], figures: Figures, within: Callable[[], AbstractContextManager] = nullcontext
+    ) -> list[dict]:
         """Measure all settings in rounds, each with the same fresh rays for all: one row per setting.
 
         A row holds series, sampler, rays, the figures (root mean square over the rounds; None stays None), and seconds,
-        seconds_min, seconds_max (median and extremes).  One untimed run of the smallest setting comes first (warm-up).
+        seconds_min, seconds_max (median and extremes).  Before a round comes an untimed run of the smallest setting (warm-up).
+        Several processes (`ranks`) share the rounds.
+
+        Args:
+            within: a context for the images.
         """
         found: list[list[dict]] = [[] for _ in settings]
         times: list[list[float]] = [[] for _ in settings]
-        self.image(min(settings, key=lambda s: s.rays), self.seed)
-        for k in range(self.repeats):
+        seeds = range(self.seed, self.seed + self.repeats)
+        for images in self._mapped(partial(_round, self, settings, within), seeds, sum(s.rays for s in settings)):
             before = None
-            for i, setting in enumerate(settings):
-                start = time.perf_counter()
-                image = self.image(setting, self.seed + k)
-                times[i].append(time.perf_counter() - start)
+            for i, (setting, (image, seconds)) in enumerate(zip(settings, images, strict=True)):
+                times[i].append(seconds)
                 found[i].append(figures(setting, image, before))
                 before = image
-                self._tick(setting.rays)
         rows = []
         for setting, values, seconds in zip(settings, found, times, strict=True):
             row = {"series": setting.series, "sampler": setting.sampler, "rays": self.sampler(setting, 0).count}
@@ -153,10 +160,37 @@ class Benchmark:
             rows.append(row)
         return rows
 
-    def _tick(self, rays: int) -> None:
-        self.done += rays
-        if self.progress is not None:
-            self.progress(self.done, self.total)
+    def _mapped(self, function: Callable[[int], R], seeds: Sequence[int], rays: int) -> list[R]:
+        """`ranks.mapped` over seeds, for each of which so many rays are traced."""
+        before = self.done
+
+        def told(done: int) -> None:
+            self.done = before + done * rays
+            if self.progress is not None:
+                self.progress(self.done, self.total)
+
+        return ranks.mapped(function, seeds, told)
+
+    def __getstate__(self) -> dict:
+        return vars(self) | {"progress": None}  # for other processes, which tell nothing
+
+
+def _image(bench: Benchmark, setting: Setting, seed: int) -> Tensor:
+    return bench.image(setting, seed)
+
+
+def _round(
+    bench: Benchmark, settings: Sequence[Setting], within: Callable[[], AbstractContextManager], seed: int
+) -> list[tuple[Tensor, float]]:
+    """Image and time, s, of each setting with the rays of a seed."""
+    found = []
+    with within():
+        bench.image(min(settings, key=lambda s: s.rays), bench.seed)
+        for setting in settings:
+            start = time.perf_counter()
+            image = bench.image(setting, seed)
+            found.append((image, time.perf_counter() - start))
+    return found
 
 
 def busy_warning(rows: Sequence[dict]) -> str:

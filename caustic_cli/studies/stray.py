@@ -34,9 +34,9 @@ class _Beside:
         """Number of rays."""
         return self.rays.count
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
+    def chunks(self, size: int = 1 << 20) -> Iterator[RayState]:
         """As of an `Emission`."""
-        for rays in self.rays.chunks(size, first, step):
+        for rays in self.rays.chunks(size):
             assert isinstance(rays, RayState)  # of all near sources
             x, y = (torch.as_tensor(c) - m for c, m in zip(rays.origin[:2], self.middle, strict=True))
             own = (x.abs() <= self.half[0]) & (y.abs() <= self.half[1])

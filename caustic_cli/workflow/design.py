@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -180,16 +181,16 @@ def _refuse_edited(project: Project, designer: Designer, state: State) -> None:
         )
 
 
-def follow() -> None:
-    """Main loop of all ranks but the first, whose signals the first handles."""
-    with signals_collected():
-        ranks.serve()
-
-
 def _joined(settings: Settings, picture: Picture, state: State, limit: float, device: str) -> None:
     """Run a design together with the first rank, without reading or writing files."""
     problem = problem_of(Project(None, settings, picture), device)
     Designer(problem).run(state, iterations=settings.design.iterations, time_limit=limit)
+
+
+def _joined_index(settings: Settings, picture: Picture, state: State, total: int, device: str) -> None:
+    """The same for a gradient index."""
+    problem = problem_of(Project(None, settings, picture), device)
+    problem.iterate(settings.lens, state, total, time.monotonic(), math.inf, lambda: False, lambda now: None)
 
 
 def _on_cpu(state: State) -> State:
@@ -239,17 +240,17 @@ def _run(
     with announce_compilation(say), signals_collected(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
             records.keep(state)
-            ranks.send(partial(_joined, project.settings, project.picture, _on_cpu(state), limit, problem.device))
-            state = designer.run(
-                state,
-                iterations=chosen.iterations,
-                time_limit=limit,
-                stop=lambda: bool(asked) or watch.reaches(aim),
-                further=lambda: watch.goes_on(aim),
-                on_iteration=watch,
-                on_objective=watch.measure_if_due,
-                notice=say.say,
-            )
+            with ranks.together(partial(_joined, project.settings, project.picture, _on_cpu(state), limit, problem.device)):
+                state = designer.run(
+                    state,
+                    iterations=chosen.iterations,
+                    time_limit=limit,
+                    stop=lambda: bool(asked) or watch.reaches(aim),
+                    further=lambda: watch.goes_on(aim),
+                    on_iteration=watch,
+                    on_objective=watch.measure_if_due,
+                    notice=say.say,
+                )
             if not asked and watch.reaches(aim):
                 state.reason = REACHED
             if not asked and not chosen.iterations and problem.options.parametrisation.free and state.reason in DONE:
@@ -295,7 +296,8 @@ def _run_index(
                 show("index", f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", now.total, total)
                 movie.record(now, target, project.settings.target.encoding, False)
 
-            values, state = problem.iterate(lens, state, total, began.wall, limit, lambda: bool(asked), on_iteration)
+            with ranks.together(partial(_joined_index, project.settings, project.picture, _on_cpu(state), total, problem.device)):
+                values, state = problem.iterate(lens, state, total, began.wall, limit, lambda: bool(asked), on_iteration)
         if not asked and not chosen.iterations and state.reason in DONE:
             state = replace(state, optimizer={})
         lens = lens.changed(index_file=attachments.index_attached(values))

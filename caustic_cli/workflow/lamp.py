@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -25,11 +26,12 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.lamp_mitsuba import FINE, plane_of, write_lamp_mitsuba
 from caustic_cli.inverse.accuracy_cost import Start
 from caustic_cli.inverse.designer import State
-from caustic_cli.inverse.lamp import design_lamp, final_field, judged_pixels, pixels_of, refuse_thin, stages_of, wanted
+from caustic_cli.inverse.lamp import design_lamp, final_field, first_lamp, judged_pixels, pixels_of, refuse_thin, stages_of, wanted
 from caustic_cli.inverse.lamp_limits import chip_limits
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import WIDE, Picture, write_image, write_npy
 from caustic_cli.loading import OnDemand
+from caustic_cli.optics import ranks
 from caustic_cli.optics.lamp import uncoated_limit
 from caustic_cli.optics.lamp_array import clear_pitch
 from caustic_cli.optics.surfaces.polarfield import PolarField
@@ -249,9 +251,13 @@ def _run(project: Project, before: Checkpoint | None, force: bool, say: Reporter
     with project.hold:
         threads = torch.get_num_threads()
         with say.progress(total) as show, one_thread():  # each of those that trace a part of the rays
-            begun = None if before is None else (before.state.stage, PolarField(before.spaces), before.state.heights)
-            how: dict[str, Any] = {"effort": effort, "begun": begun, "threads": threads}
-            values = design_lamp(lamp, goal, picture, **how, on_iteration=told, on_stage=save)
+            if before is None:
+                begun = first_lamp(lamp, goal, picture, effort)
+            else:
+                begun = before.state.stage, PolarField(before.spaces), before.state.heights
+            designed = partial(design_lamp, lamp, goal, picture, effort=effort, begun=begun, threads=threads)
+            with ranks.together(designed):
+                values = designed(on_iteration=told, on_stage=save)
         found = LampDesign(project, lamp, goal, final_field(lamp, effort), values, picture, {})
         evaluation = found.evaluated(None, s.design.seed)
         for words in warnings(lamp, goal, evaluation.figures):

@@ -69,12 +69,9 @@ class Emission:
         """Number of rays."""
         return self.shape[0] * self.shape[1] * _positions(self.scene)
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
-        """The rays in order, at most `size` per chunk; powers and losses sum to 1 over all chunks.
-
-        With `step`, only every step-th chunk from number `first` on: the share of one of several processes.
-        """
-        for start in range(first * size, self.count, step * size):
+    def chunks(self, size: int = 1 << 20) -> Iterator[RayState]:
+        """The rays in order, at most `size` per chunk; powers and losses sum to 1 over all chunks."""
+        for start in range(0, self.count, size):
             stop = min(start + size, self.count)
             yield self._drawn(start, *numbers(self.kind, self.shape, self.seed, self.dimensions, start, stop, self.device))
 
@@ -88,7 +85,7 @@ class Emission:
         """Whether its rays can be had as `pencils`."""
         return False
 
-    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
+    def pencils(self, size: int = 1 << 20) -> Iterator[Bundle]:
         """The rays in `chunks` of whole rows, as pencils, or as beams where their vertex is at infinity."""
         raise NotImplementedError
 

@@ -80,10 +80,10 @@ class MeasuredRays:
         """Number of rays, all through the pupil."""
         return len(self._drawn[0])
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
+    def chunks(self, size: int = 1 << 20) -> Iterator[RayState]:
         """As of an `Emission`."""
         missed = 1.0 - float(self._drawn[-1].sum())
-        for start in range(first * size, self.count, step * size):
+        for start in range(0, self.count, size):
             x, y, dx, dy, dz, power = (c[start : start + size] for c in self._drawn)
             lost = missed * len(power) / self.count
             yield RayState((x, y, self.scene.pupil.z), (dx, dy, dz), power, lost={"missed_lens": lost})

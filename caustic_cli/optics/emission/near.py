@@ -68,12 +68,11 @@ class Near(Emission):
         room = min(r - abs(far) for far, r in pupil.aperture.distances(torch.tensor(x), torch.tensor(y)))
         return 0.0 <= float(room) < NEAR * (pupil.z - z)
 
-    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Pencil]:
+    def pencils(self, size: int = 1 << 20) -> Iterator[Pencil]:
         source, pupil = self.scene.source, self.scene.pupil
-        nv = self.shape[1]
         x, y, z = map(float, source.points()[0][0])
-        start = first * max(1, size // nv) * nv
-        for sample in Sampler(self.kind, self.shape, self.seed, device=self.device).chunks(size, first, step):
+        start = 0
+        for sample in Sampler(self.kind, self.shape, self.seed, device=self.device).chunks(size):
             yield Pencil(
                 replace(sample, flux=self._areas(sample)),
                 pupil.half_size,
@@ -83,7 +82,7 @@ class Near(Emission):
                 sample.count / self.count,
                 partial(self._at_points, start, start + sample.count),
             )
-            start += step * sample.count
+            start += sample.count
 
     def _at_points(self, start: int, stop: int) -> RayState:
         """Rays number start to stop."""

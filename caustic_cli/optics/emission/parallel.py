@@ -43,14 +43,14 @@ class TiltedPlane(Emission):
         """As of an `Emission`."""
         return cls(scene, kind, parallel(scene, kind, rays, seed, device).shape, seed, device)
 
-    def _samples(self, size: int, first: int, step: int) -> Iterator[Sample]:
+    def _samples(self, size: int) -> Iterator[Sample]:
         """The points of the aperture, as of a plane wave along z."""
         whole = parallel(self.scene, self.kind, self.count, self.seed, self.device)
-        return replace(whole, shape=self.shape).chunks(size, first, step)
+        return replace(whole, shape=self.shape).chunks(size)
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
+    def chunks(self, size: int = 1 << 20) -> Iterator[RayState]:
         """As of an `Emission`."""
-        for sample in self._samples(size, first, step):
+        for sample in self._samples(size):
             yield self._at(sample)
 
     @property
@@ -58,10 +58,10 @@ class TiltedPlane(Emission):
         """Whether its rays can be had as `pencils`, with their vertex at infinity: where a profile does not weight them."""
         return not self.scene.source.uneven
 
-    def pencils(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
+    def pencils(self, size: int = 1 << 20) -> Iterator[Bundle]:
         """The rays in `chunks`, as beams: through as many points of the exit."""
         pupil, axis = self.scene.pupil, self.scene.source.axis
-        for sample in self._samples(size, first, step):
+        for sample in self._samples(size):
             emitted = float(sample.flux.expand(sample.shape).sum())
             exit = replace(sample, flux=self._areas(sample))
             yield beam.Beam(exit, pupil.aperture, axis, pupil.z, 1.0 / pupil.aperture.area, emitted, partial(self._at, sample))

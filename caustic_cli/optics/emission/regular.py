@@ -36,13 +36,13 @@ class RegularGrid(Emission):
         """Number of rays."""
         return self.shape[0] * self.shape[1]
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
+    def chunks(self, size: int = 1 << 20) -> Iterator[RayState]:
         """As of an `Emission`; powers sum to the mode's power on the pupil within the accuracy of the quadrature."""
         assert self.mode is not None
         (nu, nv), pupil = self.shape, self.scene.pupil
         shift = [(0.5 + self.number * s) % 1.0 for s in SHIFTS]
         cell = 4.0 * pupil.half_size[0] * pupil.half_size[1] / self.count
-        for start in range(first * size, self.count, step * size):
+        for start in range(0, self.count, size):
             k = torch.arange(start, min(start + size, self.count), device=self.device)
             u, v = ((i.double() + s) / n for i, s, n in zip((k // nv, k % nv), shift, (nu, nv), strict=True))
             state = self.mode.through(u, v)

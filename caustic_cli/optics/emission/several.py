@@ -26,10 +26,10 @@ class SeveralRays:
         """Total number of rays."""
         return sum(one.count for one in self.members)
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample | RayState]:
+    def chunks(self, size: int = 1 << 20) -> Iterator[Sample | RayState]:
         """As of an `Emission`, source by source; powers and losses of all sum to 1."""
         for one, fraction in zip(self.members, self.fractions, strict=True):
-            for rays in one.chunks(size, first, step):
+            for rays in one.chunks(size):
                 if isinstance(rays, Sample):
                     yield replace(rays, flux=fraction * rays.flux)
                 else:

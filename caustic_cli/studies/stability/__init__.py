@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 from matplotlib.figure import Figure
 
+from caustic_cli.optics import ranks
 from caustic_cli.studies.report import COLOURS, Drawing, Study
 from caustic_cli.studies.stability import elements, images, light, refraction, splines, surfaces, systems, waves
 from caustic_cli.studies.stability.case import Case
@@ -45,27 +46,27 @@ def words(value: float) -> str:
 
 def run_stability(progress: Callable[[int, int], None]) -> Study:
     """Measure every case, the worst of its settings."""
-    rows = []
-    for k, case in enumerate(CASES):
-        began = time.perf_counter()
-        naive, ours = case.worst()
-        rows.append(
-            {
-                "series": case.family,
-                "error_of": case.error_of,
-                "naively": case.naively,
-                "naive": naive if math.isfinite(naive) else None,
-                "naive_words": words(naive),
-                "error": ours if math.isfinite(ours) else None,
-                "bound": case.bound,
-                "holds": bool(ours <= case.bound),
-                "seconds": time.perf_counter() - began,
-            }
-        )
-        progress(k + 1, len(CASES))
+    rows = ranks.mapped(_measured, range(len(CASES)), lambda done: progress(done, len(CASES)))
     broken = [row["series"] for row in rows if not row["holds"]]
     advice = f"beyond their bounds: {', '.join(broken)}" if broken else f"all {len(rows)} cases are within their bounds"
     return Study("stability", COLUMNS, rows, {}, advice, {}, plots=PLOTS, table=[HEADINGS, *map(in_words, rows)])
+
+
+def _measured(number: int) -> dict:
+    """The row of a case."""
+    case, began = CASES[number], time.perf_counter()
+    naive, ours = case.worst()
+    return {
+        "series": case.family,
+        "error_of": case.error_of,
+        "naively": case.naively,
+        "naive": naive if math.isfinite(naive) else None,
+        "naive_words": words(naive),
+        "error": ours if math.isfinite(ours) else None,
+        "bound": case.bound,
+        "holds": bool(ours <= case.bound),
+        "seconds": time.perf_counter() - began,
+    }
 
 
 def in_words(row: dict) -> tuple[str, ...]:
