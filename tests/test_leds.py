@@ -19,7 +19,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
-from caustic_cli.scene.lens import array_control, lenslet_centres
+from caustic_cli.scene.lens import array_control
 from caustic_cli.scene.sources.gaussian import Gaussian
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
@@ -36,7 +36,7 @@ def led_scene(source=LED, array=(2, 1), spans=8, **lens) -> Scene:
     control = tuple(array_control(spans * k + 3, 3, k) for k in array)
     made = Lens((6.0 * array[0], 6.0 * array[1]), control=control, array=array, min_thickness=0.5, **lens)
     made = replace(made, offset=replace(made.offset, thickness=2.0))
-    lit = behind_lenslets(source, Light(), lenslet_centres(array, made.size), made.pupil)
+    lit = behind_lenslets(source, Light(), made.cells.centres, made.pupil)
     return Scene(lit, made, Screen((60.0, 50.0), 80.0, (24, 20)))
 
 

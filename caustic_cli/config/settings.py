@@ -26,8 +26,8 @@ from caustic_cli.loading import OnDemand
 from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
 from caustic_cli.scene.aperture import Aperture, Pupil, larger
 from caustic_cli.scene.gradient import KINDS, Gradient
-from caustic_cli.scene.lens import lenslet_centres
 from caustic_cli.scene.materials import refractive_index
+from caustic_cli.scene.packing import cells_of
 from caustic_cli.scene.screen import PLANE, Sags
 from caustic_cli.scene.sources.plane import GRAZING
 from caustic_cli.scene.sources.section import content
@@ -404,6 +404,8 @@ def build_lens(lens: LensSettings) -> Lens:
         lens.aperture,
         lens.border,
         lens.array,
+        lens.packing,
+        lens.lenslets,
         gradient=build_gradient(lens),
         crossing=lens.crossing,
     )
@@ -449,8 +451,8 @@ def build_source(source: SourceSettings, type: str | None = None, lens: LensSett
         if lens.mirror:
             raise InputError("⟨source.each⟩ is for lenses: behind the lenslets of a mirror, sources would stand in its light")
         pupil = Pupil(Aperture((lens.size[0] / 2.0, lens.size[1] / 2.0)), lens.z_in)
-        centres, (light,) = lenslet_centres(lens.array, lens.size), sources.several.lights_of(source)
-        return sources.several.behind_lenslets(one, light, centres, pupil)
+        cells, (light,) = cells_of(lens.packing, lens.array, lens.size), sources.several.lights_of(source)
+        return sources.several.behind_lenslets(one, light, cells.centres, pupil)
     return one if type is not None else sources.combined(one, source)
 
 

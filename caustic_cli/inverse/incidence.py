@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, singledispatch
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -34,14 +34,14 @@ from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
-from caustic_cli.scene import Aperture, CircularAperture, Scene
+from caustic_cli.scene import Aperture, Scene
 from caustic_cli.scene.sources.distribution import relative
 
 #: Newton iterations for q; the function is concave, so that they increase monotonically from the greater of two lower bounds.
 STEPS = 40
 #: Finite-difference step on the pupil, mm; cells of the pupil along each axis; least magnification from the pupil to the exit.
 _STEP, CELLS, LEAST_GROWTH = 1e-5, 128, 1e-3
-#: Subsamples along each axis of a cell cut by a circular aperture.
+#: Subsamples along each axis of a cell cut by an aperture.
 PARTS = 8
 #: Points along an edge of the lit part of the exit, and iterations for its place.
 EDGE, PASSES = 65, 3
@@ -66,7 +66,7 @@ def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
         InputError: the source lies behind the entrance.
     """
     light, directions = (_traced if is_traced(scene) else _direct)(scene, x, y, z)
-    return light * _part_within(scene.lens.opening, x, y), directions
+    return light * part_within(scene.lens.clear, x, y), directions
 
 
 def is_traced(scene: Scene) -> bool:
@@ -272,15 +272,11 @@ def _pupil_irradiance(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return RegularGridInterpolator(middles, light)(points)
 
 
-@singledispatch
-def _part_within(aperture: Aperture, x: np.ndarray, y: np.ndarray) -> np.ndarray | float:
-    """Fraction of each cell with corners x, y of a rectangle that is within the aperture."""
-    return 1.0
-
-
-@_part_within.register(CircularAperture)
-def _(aperture: CircularAperture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """By PARTS x PARTS subsamples."""
+def part_within(aperture: Aperture, x: np.ndarray, y: np.ndarray) -> np.ndarray | float:
+    """Fraction of each cell with corners x, y of the rectangle of its half widths that is within the aperture, by PARTS x PARTS
+    subsamples."""
+    if aperture.area == 4.0 * math.prod(aperture.half_size):
+        return 1.0
     fine = [np.linspace(c[0], c[-1], 2 * PARTS * (len(c) - 1) + 1)[1::2] for c in (x, y)]
     inside = aperture.contains(fine[0][:, None], fine[1][None, :]).astype(float)
     return inside.reshape(len(x) - 1, PARTS, len(y) - 1, PARTS).mean((1, 3))

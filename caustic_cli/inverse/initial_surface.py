@@ -21,7 +21,7 @@ from torch import Tensor
 
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.incidence import incident, is_traced, lit_rectangle
+from caustic_cli.inverse.incidence import incident, is_traced, lit_rectangle, part_within
 from caustic_cli.inverse.projection import CrossedProjection, ScreenProjection, projection_of, seen_by_light
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scattered import Pixels
@@ -112,7 +112,7 @@ class _Grid:
         if not (mx or my):
             return whole
         size = 2.0 * float(self.x[-1]), 2.0 * float(self.y[-1])
-        lens = replace(whole.lens, size=size, aperture=Aperture.name)  # what is dark of it is so in `incident`
+        lens = replace(whole.lens, size=size, aperture=Aperture.name, outline=None)  # what is dark of it is so in `incident`
         (sx, sy) = whole.screen.shift
         return replace(whole, lens=lens, screen=replace(whole.screen, shift=(sx - mx, sy - my)))
 
@@ -131,7 +131,8 @@ class _Grid:
         if self.array is None:
             return incident(self.whole, *self.places, z)
         scene, at = self.array
-        return incident(scene, *(c + a for c, a in zip(self.places, at, strict=True)), z)
+        light, directions = incident(scene, *(c + a for c, a in zip(self.places, at, strict=True)), z)
+        return light * part_within(self.whole.lens.clear, *self.places), directions
 
     @property
     def floor(self) -> float:

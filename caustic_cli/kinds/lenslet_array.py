@@ -22,6 +22,7 @@ from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.surface import Described, OneSurface
 from caustic_cli.scene import Scene
 from caustic_cli.scene.lens import array_control
+from caustic_cli.scene.packing import cells_of
 
 
 class LensletArray(OneSurface):
@@ -68,10 +69,20 @@ class LensletArray(OneSurface):
             )
         d.set_control(fits)
 
-    @staticmethod
-    def fitting(d: Defaults) -> list[int]:
+    @classmethod
+    def fitting(cls, d: Defaults) -> list[int]:
         """The control net next to that set so far that lenslets share."""
-        return [array_control(n, p, k) if k > 1 else n for n, p, k in zip(d.lens.control, d.lens.degree, d.lens.array, strict=True)]
+        pieces = cls.pieces(d)
+        return [array_control(n, p, k) if k > 1 else n for n, p, k in zip(d.lens.control, d.lens.degree, pieces, strict=True)]
+
+    @staticmethod
+    def pieces(d: Defaults) -> tuple[int, int]:
+        """Pieces of the spline along x and y between which the borders of lenslets are."""
+        return cells_of(d.lens.packing, d.lens.array, d.lens.size).pieces
+
+    @classmethod
+    def has_creases(cls, d: Defaults) -> bool:
+        return super().has_creases(d) or cls.pieces(d) != tuple(d.lens.array)
 
     @classmethod
     def creased(cls, d: Defaults, waves: list[Table]) -> bool:

@@ -261,15 +261,20 @@ class OneSurface(Problem):
 
     @classmethod
     def creased(cls, d: Defaults, waves: list[Table]) -> bool:
-        """Whether the picture has dark gaps, for whose creases the control net is then made fine.
+        """Whether the picture has dark gaps, or borders are not on knots, for whose creases the control net is then made fine.
 
         Diffraction and extended sources smooth creases more than a coarser net.
         """
-        creased = d.gaps >= GAPS and not (d.own_control or waves or d.shaped or cls.spread(d))
+        creased = cls.has_creases(d) and not (d.own_control or waves or d.shaped or cls.spread(d))
         if creased:
             plan = d.effort.creased if d.by_rows else d.effort.creased.coarser
             d.set_control([creased_control(max(d.resolution), p, plan) for p in d.lens.degree])
         return creased
+
+    @classmethod
+    def has_creases(cls, d: Defaults) -> bool:
+        """Whether the surface has creases where its spline has none."""
+        return d.gaps >= GAPS
 
     @classmethod
     def refinement(cls, d: Defaults, creased: bool = False) -> list[Table]:

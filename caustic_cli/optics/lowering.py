@@ -80,6 +80,7 @@ def _is_upright(element: Element, pupil: Pupil) -> bool:
     surface = element.surface
     return (
         isinstance(surface, HeightField)
+        and element.aperture.compiled
         and element.pose == Pose()
         and element.aperture.half_size == surface.half_size == pupil.half_size
     )

@@ -192,7 +192,7 @@ class System:
         surface = surface or HeightField.of(lens)
         entrance = Plane() if not scene.two_sided else surface if lens.entrance is None else entrance_of(lens)
         elements: tuple[Element, ...] = (
-            Element(EXIT, surface, lens.opening, lens.interaction.name, fresnel=lens.fresnel, roughness=lens.roughness),
+            Element(EXIT, surface, lens.clear, lens.interaction.name, fresnel=lens.fresnel, roughness=lens.roughness),
         )
         if not lens.mirror:
             first = Element(

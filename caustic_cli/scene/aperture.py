@@ -20,7 +20,7 @@ import numpy as np
 from caustic_cli.errors import InputError
 
 
-def _library(array) -> Any:
+def library(array) -> Any:
     """NumPy or torch, of which an array is."""
     return sys.modules[type(array).__module__]
 
@@ -37,11 +37,15 @@ class Aperture:
     #: Half widths, mm.
     half_size: tuple[float, float] = (math.inf, math.inf)
 
-    #: Its name among the settings; whether it is a circle, for compiled loops, which take no objects.
+    #: Its name among the settings; whether it is a circle, and whether compiled loops, which take no objects, know it.
     name: ClassVar[str] = "rectangle"
     round: ClassVar[bool] = False
-    #: Its area over the product of the half widths.
-    filled: ClassVar[float] = 4.0
+    compiled: ClassVar[bool] = True
+
+    @property
+    def filled(self) -> float:
+        """Its area over the product of the half widths."""
+        return 4.0
 
     @property
     def radius(self) -> float | None:
@@ -121,7 +125,11 @@ class CircularAperture(Aperture):
 
     name: ClassVar[str] = "circle"
     round: ClassVar[bool] = True
-    filled: ClassVar[float] = math.pi
+
+    @property
+    def filled(self) -> float:
+        """As of an aperture."""
+        return math.pi
 
     def __post_init__(self):
         if self.half_size[0] != self.half_size[1]:
@@ -144,12 +152,12 @@ class CircularAperture(Aperture):
 
     def distances(self, x, y) -> tuple[tuple[Any, float], ...]:
         """As of an aperture."""
-        return ((_library(x).hypot(x, y), self.radius),)
+        return ((library(x).hypot(x, y), self.radius),)
 
     def edges(self, x, y, half_size: tuple[float, float]) -> tuple[Any, Any | None]:
         """As of an aperture; distances from an ellipse as along x."""
         rx, ry = half_size
-        return rx - _library(x).hypot(x, y * (rx / ry)), None
+        return rx - library(x).hypot(x, y * (rx / ry)), None
 
     def contains(self, x, y):
         """As of an aperture."""
@@ -161,13 +169,13 @@ class CircularAperture(Aperture):
 
     def encloses(self, lows, highs):
         """As of an aperture: its farthest corner is inside."""
-        most = _library(lows[0]).maximum
+        most = library(lows[0]).maximum
         x, y = (most(-low, high) for low, high in zip(lows, highs, strict=True))
         return super().encloses(lows, highs) & (x**2 + y**2 <= self.radius * self.radius)
 
     def spread(self, u, v) -> tuple[Any, Any]:
         """As of an aperture."""
-        xp, r = _library(u), self.radius
+        xp, r = library(u), self.radius
         return r * xp.sqrt(u) * xp.cos(2.0 * math.pi * v), r * xp.sqrt(u) * xp.sin(2.0 * math.pi * v)
 
     def farthest(self, distance: Callable[[np.ndarray, np.ndarray], np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:

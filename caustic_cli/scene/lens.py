@@ -12,16 +12,23 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.loading import OnDemand
 from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of, larger
 from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.interaction import Interior, Reflecting, Refracting, interaction_of
 from caustic_cli.schema import checks
 from caustic_cli.schema.table import TABLE, check, check_all, default
+
+if TYPE_CHECKING:
+    from caustic_cli.scene.packing import Cells
+
+packings = OnDemand("caustic_cli.scene.packing")
 
 
 @dataclass(frozen=True)
@@ -87,12 +94,6 @@ class Offset:
         return self.thickness + self.sag(x[:, None], y[None, :])
 
 
-def lenslet_centres(array: tuple[int, int], size: tuple[float, float]) -> list[tuple[float, float]]:
-    """Centres (x, y), mm, of the lenslets of an array of this size, j fastest."""
-    x, y = ([((k + 0.5) / n - 0.5) * w for k in range(n)] for n, w in zip(array, size, strict=True))
-    return [(a, b) for a in x for b in y]
-
-
 def array_control(n: int, degree: int, lenslets: int) -> int:
     """The least number of control points, at least n, for which all lenslets of a row have equally many knot spans; see
     `open_knots`."""
@@ -142,12 +143,17 @@ class Lens:
     border: float = default("lens.border")
     #: Numbers of lenslets along x and y, whose surfaces are continuous across their borders; (1, 1) is a single lens.
     array: tuple[int, int] = default("lens.array")
+    #: How they are packed, square or hexagonal; and whether they are filled, or round ones in an opaque mask.
+    packing: str = default("lens.packing")
+    lenslets: str = default("lens.lenslets")
     #: The free-form entrance; None for a plane one.
     entrance: FreeForm | None = None
     #: Gradient-index distribution, with `index` for n_0 of its formula; None for a homogeneous lens.
     gradient: Gradient | None = None
     #: Of the two surfaces that send light to a picture, the one behind which it crosses over.
     crossing: bool = default("lens.crossing")
+    #: What is clear of the exit of a lens that is a lenslet of an array; None for all, or for the lenslets of an array.
+    outline: Aperture | None = None
 
     def __post_init__(self):
         check_all(
@@ -165,6 +171,8 @@ class Lens:
             "aperture",
             "border",
             "array",
+            "packing",
+            "lenslets",
         )
         least = iter(self.degree)
         checks.pair("⟨lens.control⟩", self.control, lambda w, n: checks.whole(w, n, next(least) + 1, TABLE["lens.control"].high))
@@ -186,6 +194,7 @@ class Lens:
             raise InputError("⟨lens.aperture⟩ of an array must be a rectangle, which its lenslets fill")
         if self.knots is not None:
             raise InputError("⟨lens.array⟩ has knots of its own: give no knots_u and knots_v")
+        _ = self.cells
 
     @property
     def interaction(self) -> Refracting | Reflecting:
@@ -208,6 +217,16 @@ class Lens:
         """Whether it is an array of lenslets."""
         return max(self.array) > 1
 
+    @cached_property
+    def cells(self) -> Cells:
+        """Where the lenslets of an array are."""
+        return packings.cells_of(self.packing, self.array, self.size)
+
+    @property
+    def pieces(self) -> tuple[int, int]:
+        """Pieces of its spline along x and y, between which creases may lie."""
+        return self.cells.pieces if self.arrayed else (1, 1)
+
     @property
     def half_size(self) -> tuple[float, float]:
         """(r_x, r_y) mm."""
@@ -217,6 +236,18 @@ class Lens:
     def opening(self) -> Aperture:
         """Its aperture."""
         return aperture_of(self.aperture, self.size, "lens.size")
+
+    @cached_property
+    def clear(self) -> Aperture:
+        """What of its exit is clear: its aperture, or round lenslets."""
+        if self.outline is not None:
+            return self.outline
+        return packings.RoundLenslets(self.half_size, self.cells) if self.round_lenslets else self.opening
+
+    @property
+    def round_lenslets(self) -> bool:
+        """Whether it is an array of round lenslets in an opaque mask."""
+        return self.arrayed and self.lenslets == "round"
 
     @cached_property
     def pupil(self) -> Pupil:
@@ -273,6 +304,7 @@ class Lens:
             border=factor * self.border,
             entrance=None if self.entrance is None else self.entrance.scaled(factor),
             gradient=None if self.gradient is None else self.gradient.scaled(factor),
+            outline=None if self.outline is None else self.outline.scaled(factor),
         )
 
     def height_bounds(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

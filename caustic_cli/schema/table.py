@@ -379,6 +379,12 @@ class LensSettings(Section):
             written=False, option=Option("--border", "MM"))
     array: Wholes = setting("lenslets along x and y, each of which projects the whole picture, or lamps on a board", low=1,
             high=100, default=[1, 1], written=False, option=Option("--array", "N[xM]"))
+    packing: str = setting("how lenslets are packed: square, or hexagonal, in rows of which every second one is displaced by half a"
+            " lenslet", choices=("square", "hexagonal"), default="square", written=False,
+            option=Option("--packing", "square|hexagonal"))
+    lenslets: str = setting("shape of lenslets: filled, cells without gaps, or round, the largest circles within the cells, in an"
+            " opaque mask", choices=("filled", "round"), default="filled", written=False,
+            option=Option("--lenslets", "filled|round"))
     gradient: str | None = setting("gradient index of the lens: selfoc, radial or axial, with gradient_terms; volume, with an"
             " index_file; free, designed instead of the surface, between flat sides, or"
             " together with it (with_surface)",

@@ -15,18 +15,17 @@ from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
-from caustic_cli.scene.lens import lenslet_centres
+from caustic_cli.scene.packing import Cells
 from caustic_cli.studies.retrace import sampler_for
 
 
 @dataclass(frozen=True, eq=False)
 class _Beside:
-    """The rays of a near source beside a rectangle of the pupil, given by its middle and half widths, mm; those through it count as
-    missing the lens."""
+    """The rays of a near source beside lenslet `own` of the pupil; those through it count as missing the lens."""
 
     rays: Rays
-    middle: tuple[float, float]
-    half: tuple[float, float]
+    cells: Cells
+    own: int
     device: str | torch.device = "cpu"
 
     @property
@@ -38,8 +37,7 @@ class _Beside:
         """As of an `Emission`."""
         for rays in self.rays.chunks(size):
             assert isinstance(rays, RayState)  # of all near sources
-            x, y = (torch.as_tensor(c) - m for c, m in zip(rays.origin[:2], self.middle, strict=True))
-            own = (x.abs() <= self.half[0]) & (y.abs() <= self.half[1])
+            own = self.cells.number(*map(torch.as_tensor, rays.origin[:2])) == self.own
             power = torch.where(own, torch.zeros_like(rays.power), rays.power)
             missed = rays.lost["missed_lens"] + float((rays.power - power).sum())
             yield replace(rays, power=power, lost={**rays.lost, "missed_lens": missed})
@@ -62,11 +60,9 @@ def stray_light(
         rays: of all sources; requests: of a plan.
     """
     lens, fallen, seen = scene.lens, [], []
-    half = tuple(r / k for r, k in zip(lens.half_size, lens.array, strict=True))
-    each = zip(scene.by_source, scene.source.fractions, lenslet_centres(lens.array, lens.size), strict=True)
-    for k, (one, part, middle) in enumerate(each):
+    for k, (one, part) in enumerate(zip(scene.by_source, scene.source.fractions, strict=True)):
         whole = sampler_for(one, max(1, rays // math.prod(lens.array)), seed + k, device)
-        light = _Beside(whole, middle, (half[0], half[1]), device)
+        light = _Beside(whole, lens.cells, k, device)
         image = expose(one, field, heights.to(device), light, None, torch.float64, requests=requests)
         fallen.append(part * (1.0 - image.lost["missed_lens"]))
         seen.append(part * float(image.image.sum()))

@@ -38,7 +38,7 @@ class HeightField(Surface[Tensor]):
     def of(cls, lens: Lens) -> HeightField:
         """The height field of a lens' exit."""
         if lens.knots is None:
-            u, v = (SplineSpace.uniform(n, p, k) for n, p, k in zip(lens.control, lens.degree, lens.array, strict=True))
+            u, v = (SplineSpace.uniform(n, p, k) for n, p, k in zip(lens.control, lens.degree, lens.pieces, strict=True))
         else:
             u, v = (SplineSpace(p, torch.as_tensor(t, dtype=torch.float64)) for p, t in zip(lens.degree, lens.knots, strict=True))
         return cls((u, v), lens.half_size)
