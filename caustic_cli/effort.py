@@ -89,7 +89,9 @@ class Effort:
     #: improved thin lines from 0.094 to 0.093, 12 spans in the same time to 0.081.  From 1152 spans on the start is evaluated on
     #: finer cells than it is solved on.
     creased: Refinement
-    #: The same for two free-form sides, on nets that have no ripples as wide as pixels, and with subpixels that show them.
+    #: Iterations of an array whose borders between lenslets cross knot spans, and which begins with ripples beside them.
+    borders: int
+    #: As `creased` for two free-form sides, on nets that have no ripples as wide as pixels, and with subpixels that show them.
     sides: Refinement
     #: (wavelengths of white light, iterations) of each stage on the wave image: the first ones need few.
     waves: tuple[tuple[int, int], ...]
@@ -158,6 +160,7 @@ DRAFT = Effort(
     coarse_to_fine=(15, 25),
     refinement=Refinement(1.0, 256, 16, 1_000_000, 3, ((1.0, 8),), large=LargePictures(256)),
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
+    borders=12,
     sides=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
     waves=((3, 6), (5, 6)),
     wave_seconds=8.0,
@@ -170,6 +173,7 @@ STANDARD = Effort(
         large=LargePictures(700, rays_per_pixel=8, most_rays=16_000_000, plan=((1.0, 8),)),
     ),
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
+    borders=30,
     sides=Refinement(3.0, 765, 64, 4_000_000, 8, ((1.0, 20),)),
     waves=((5, 20), (6, 20)),
     wave_seconds=25.0,
@@ -179,6 +183,7 @@ FINE = Effort(
     coarse_to_fine=(40, 120),
     refinement=Refinement(2.0, 957, 256, 16_000_000, 8, ((0.25, 16), (1.0, 16)), large=LargePictures(700)),
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
+    borders=60,
     sides=Refinement(4.0, 1021, 64, 4_000_000, 8, ((1.0, 60),)),
     waves=((5, 12), (6, 12), (8, 40)),
     wave_seconds=90.0,

@@ -82,7 +82,18 @@ class LensletArray(OneSurface):
 
     @classmethod
     def has_creases(cls, d: Defaults) -> bool:
-        return super().has_creases(d) or cls.pieces(d) != tuple(d.lens.array)
+        return super().has_creases(d) or cls._borders_cross(d)
+
+    @classmethod
+    def _borders_cross(cls, d: Defaults) -> bool:
+        """Whether the borders of lenslets cross knot spans."""
+        return cls.pieces(d) != tuple(d.lens.array)
+
+    @classmethod
+    def refinement(cls, d: Defaults, creased: bool = False) -> list[Table]:
+        stages = super().refinement(d, creased)
+        least = d.effort.borders if cls._borders_cross(d) else 0
+        return [stage | {"iterations": max(least, stage["iterations"])} for stage in stages]
 
     @classmethod
     def creased(cls, d: Defaults, waves: list[Table]) -> bool:

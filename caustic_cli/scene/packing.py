@@ -254,7 +254,8 @@ class HexagonalCells(Cells):
         for a, b in self.centres:
             if 0.0 < math.hypot(a - x, b - y) < NEIGHBOURS * self._pitch[0]:
                 found = _cut(found, (a - x, b - y), 0.5 * (a * a + b * b - x * x - y * y))
-        return tuple(found)
+        least = SLACK * self._pitch[0]
+        return tuple(p for p, q in zip(found, found[1:] + found[:1], strict=True) if math.dist(p, q) > least)
 
 
 def _cut(polygon: list[Point], normal: Point, most: float) -> list[Point]:
