@@ -91,6 +91,7 @@ SCENES: dict[str, Scene] = {
     "other elements": replace(PLAIN, elements=(Component(30.0, (20.0, 20.0)),)),
     "folded axis": replace(PLAIN, elements=(FoldMirror(50.0, (60.0, 60.0), tilt=(45.0, 0.0)),)),
     "lenslet array": lens(array=(2, 1), control=(11, 8)),
+    "round lenslets": lens(array=(2, 1), control=(11, 8), lenslets="round"),
     "circular aperture": lens(aperture="circle"),
     "absorption": lens(absorption=0.01),
     "roughness": lens(roughness=0.1),

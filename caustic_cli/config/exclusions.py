@@ -72,6 +72,8 @@ EXCLUDED: dict[str, dict[str, str]] = {
 NEEDED: dict[str, tuple[tuple[str, ...], str]] = {
     "target.sheet": (("lens.array",), _SHEET),
     "source.each": (("lens.array",), "⟨source.each⟩ needs ⟨+lens.array⟩, for each of whose lenslets there is a source"),
+    "lens.packing": (("lens.array",), "⟨lens.packing⟩ is that of lenslets, which ⟨+lens.array⟩ makes"),
+    "lens.lenslets": (("lens.array",), "⟨lens.lenslets⟩ is the shape of lenslets, which ⟨+lens.array⟩ makes"),
     "second.file": (("second.z",), "⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen"),
     **{
         feature: (TRAITS["two sides"].settings, f"⟨{feature}⟩ belongs to ⟨+second.file⟩, which is not given")

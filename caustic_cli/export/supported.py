@@ -25,6 +25,10 @@ SCREEN = (
     "⟨format⟩ {format} has a screen at a distance, and this lens' picture is in the far field;"
     f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold the lens alone"
 )
+MASK = (
+    "⟨format⟩ {format} holds a lens that is clear all over, not {};"
+    f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold its shape alone"
+)
 #: Of BEYOND_CLEAR, what Mitsuba's files hold, and what has a message of its own.
 HELD = ("mirror", "gradient index", "tilted screen", "shifted screen", "far field")
 
@@ -61,7 +65,7 @@ _UNSUPPORTED: dict[str, Mapping[str, str]] = {
 
 
 def _exported(format: str) -> Capability:
-    index = {"gradient index": SHAPE} if format in ONE_INDEX else {}
+    index = {"gradient index": SHAPE, "round lenslets": MASK} if format in ONE_INDEX else {}
     return Capability(f"export to {format}", index | _UNSUPPORTED.get(format, {}))
 
 

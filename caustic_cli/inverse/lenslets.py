@@ -74,7 +74,7 @@ class Section:
         first, last = whole.span(torch.tensor([low + KNOT_RESOLUTION, high - KNOT_RESOLUTION], dtype=torch.float64)).tolist()
         own = SplineSpace(p, torch.cat([t.new_zeros(p + 1), (inner - low) / (high - low), t.new_ones(p + 1)]))
         where = slice(first - p, last + 1)
-        if own.n == where.stop - where.start and (low == 0.0 or abs(float(t[first - p + 1]) - low) < KNOT_RESOLUTION):
+        if t[first - p + 1] > low - KNOT_RESOLUTION and t[last + p] < high + KNOT_RESOLUTION:
             return cls(own, where, None)
         at = (low + (high - low) * own.greville).clamp(low + KNOT_RESOLUTION, high - KNOT_RESOLUTION)
         return cls(own, where, own.interpolated(whole.matrix(at)[:, where]))

@@ -169,7 +169,7 @@ def etendue_limit(scene: Scene) -> float | None:
     lens, screen, source = scene.lens, scene.screen, scene.source
     if not source.even:
         return None
-    x, y, cell = _area(lens.half_size, lens.opening)
+    x, y, cell = _area(lens.half_size, lens.clear)
     area = cell * len(x)
     if source.distant:
         given = area * math.pi * math.sin(source.half_angle) ** 2 * source.axis[2]

@@ -50,6 +50,7 @@ TRAITS: Mapping[str, Trait] = {
     "other elements": Trait("other elements beside it", lambda s: bool(s.unfolded.elements), ("element.reshapes",)),
     "folded axis": Trait("an axis folded by flat mirrors", lambda s: s.unfolded is not s),
     "lenslet array": Trait("lenslets", lambda s: s.lens.arrayed, ("lens.array",)),
+    "round lenslets": Trait("an opaque mask between round lenslets", lambda s: s.lens.round_lenslets, ("lens.lenslets round",)),
     "circular aperture": Trait("a circular aperture", lambda s: s.lens.opening.round, ("lens.aperture circle",)),
     "absorption": Trait(
         "absorption", lambda s: s.lens.absorption > 0 or any(e.absorption > 0 for e in s.elements), ("lens.absorption",)

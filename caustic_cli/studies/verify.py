@@ -63,6 +63,7 @@ VERIFICATION = Capability(
         **dict.fromkeys(
             [name for name in BEYOND_CLEAR if name not in TRACED], "⟨verify⟩ mitsuba traces clear lenses and plane screens, not {}"
         ),
+        "round lenslets": "⟨verify⟩ mitsuba traces clear lenses and plane screens, not {}",
         **dict.fromkeys(
             ("ray file", "several sources", "user-defined source"),
             "⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}",

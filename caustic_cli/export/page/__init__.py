@@ -85,6 +85,8 @@ PAGE = Capability(
     {
         "gradient index": "⟨html⟩: the page traces lenses of one index, and this one's varies",
         "other elements": "⟨html⟩: the page traces a single lens, and this scene has [[element]] tables",
+        "round lenslets": "⟨html⟩: the page traces all light that meets the surface, and round lenslets have an opaque mask between"
+        " them",
         "ray file": FILE,
         "ray file among sources": FILE,
     },
