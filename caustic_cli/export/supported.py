@@ -27,7 +27,7 @@ SCREEN = (
 )
 MASK = (
     "⟨format⟩ {format} holds a lens that is clear all over, not {};"
-    f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold its shape alone"
+    f" {', '.join(name for name in FORMATS if name not in (*ONE_INDEX, 'phase'))} hold its shape alone"
 )
 #: Of BEYOND_CLEAR, what Mitsuba's files hold, and what has a message of its own.
 HELD = ("mirror", "gradient index", "tilted screen", "shifted screen", "far field")
@@ -41,7 +41,9 @@ _UNSUPPORTED: dict[str, Mapping[str, str]] = {
             ("mirror", "gradient index", "other elements", "folded axis", "several sources"),
             "⟨format⟩ phase is that of one lens for one source, not of {}",
         ),
-        **dict.fromkeys(("ray file", "curved screen"), "⟨format⟩ phase needs a wave image, which there is none of with {}"),
+        **dict.fromkeys(
+            ("ray file", "curved screen", "round lenslets"), "⟨format⟩ phase needs a wave image, which there is none of with {}"
+        ),
     },
     "mitsuba": {
         "laser beam": BEAM,
@@ -80,6 +82,7 @@ SCRIPT = Capability(
         **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
         **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
         "gradient index": SHAPE,
+        "round lenslets": MASK,
         "far field": SCREEN,
         "tilted light": "⟨script⟩: its source shines along the axis, so light at an angle, which the archive alone holds, cannot be"
         " written",

@@ -63,6 +63,8 @@ BESIDE = 0.5
 BLURS = 2.0
 #: Tolerance of the shift-invariance error of a point-spread function, relative to the larger of diffraction blur and pixel.
 ALLOWED = 0.25
+#: Most light of a wave image over that which leaves the lens; the sum over the samples of smooth wavefronts is within 1 % of it.
+MOST_LIGHT = 1.1
 #: Largest number of points that represent an extended source, and least number per position.
 EACH, LEAST_EACH = 24, 4
 
@@ -219,7 +221,7 @@ def image_of(
                     f"a wave image of this scene takes about {samples / A_SECOND / 60:.0f} minutes on two cores; the effect"
                     " diffraction, requested by name, computes it"
                 )
-            found.append(imager.expose(light, parameters, dtype))
+            found.append(_checked(imager.expose(light, parameters, dtype)))
     return (
         found[0]
         if len(found) == 1
@@ -235,6 +237,21 @@ def image_of(
             _summed([w.halves for w in found]),
         )
     )
+
+
+def _checked(found: WaveImage) -> WaveImage:
+    """A wave image that has no more light than leaves the lens.
+
+    Raises:
+        NoWaveImage: it has, as of steps between lenslets, whose wavefront is torn between samples.
+    """
+    seen = float(found.image.detach().sum())
+    if seen > MOST_LIGHT * found.leaving:
+        raise NoWaveImage(
+            f"the surface has steps or creases that the samples of its wave image do not resolve: the screen would have"
+            f" {seen / found.leaving:.3g} times the light that leaves the lens"
+        )
+    return found
 
 
 def _summed(pairs: list[tuple[Tensor, Tensor] | None]) -> tuple[Tensor, Tensor] | None:

@@ -16,24 +16,27 @@ class NoWaveImage(CausticError):
     """The wave image of a scene is undefined, or cannot be computed."""
 
 
+MASKED = "the wave image knows the edge of one aperture, and round lenslets are many in an opaque mask"
 #: Why a scene has no wave image, as clauses.
 WAVE_IMAGE = Capability(
     "wave image",
     {
         "ray file": "a ray file contains no phase",
+        "round lenslets": MASKED,
     },
 )
 WAVE_REFINEMENT = Capability(
     "design by waves",
     {
         "ray file": "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
+        "round lenslets": f"⟨design.waves⟩ on: {MASKED}",
         "several sources": "⟨design.waves⟩ on needs one source: light of several is refined by rays alone",
     },
 )
 WAVES_BY_DEFAULT = Capability(
     "design by waves unless asked for",
     {
-        "ray file": WAVE_IMAGE.unsupported["ray file"],
+        **WAVE_IMAGE.unsupported,
         "several sources": "light of several sources is refined by rays alone",
         "two sides": "behind the creases of a free-form entrance rays cross inside the glass, and light without a single wavefront"
         " has none; ⟨waves⟩ on refines the exit where there are no creases",
