@@ -41,7 +41,7 @@ from caustic_cli.optics.waves.propagation import (
     pruning_pays,
 )
 from caustic_cli.optics.waves.sampling import Sampling, memory_free
-from caustic_cli.optics.waves.unsupported import NoWaveImage, receiver_of
+from caustic_cli.optics.waves.unsupported import NoWaveImage, receiver_of, refuse_without_image
 from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, survey, wavefront
 from caustic_cli.scene import Light, Scene, Screen, Source
 from caustic_cli.scene.materials import nearest_index
@@ -121,7 +121,12 @@ class WaveImage:
 
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
     """Spectral lines of a scene, by wavelength and polarisation: its own, those that represent its continuous spectrum, or those
-    at the given wavelengths, see `Light.lines`."""
+    at the given wavelengths, see `Light.lines`.
+
+    Raises:
+        NoWaveImage: the scene has none.
+    """
+    refuse_without_image(scene)
     scene = scene.unfolded
     if len(scene.source.members) > 1:
         return [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.system import PlacedScreen, System
-from caustic_cli.scene import Screen
+from caustic_cli.scene import Scene, Screen
 from caustic_cli.scene.traits import Capability
 
 #: Least cosine between a screen's normal and the axis: near grazing incidence off-axis light is parallel to the screen.
@@ -16,7 +16,7 @@ class NoWaveImage(CausticError):
     """The wave image of a scene is undefined, or cannot be computed."""
 
 
-MASKED = "the wave image knows the edge of one aperture, and round lenslets are many in an opaque mask"
+MASKED = "light is diffracted by the edge of every round lenslet, and a field is computed behind the edge of one aperture"
 #: Why a scene has no wave image, as clauses.
 WAVE_IMAGE = Capability(
     "wave image",
@@ -51,6 +51,16 @@ WAVES_BY_DEFAULT = Capability(
         " light; ⟨waves⟩ on refines it all the same",
     },
 )
+
+
+def refuse_without_image(scene: Scene) -> None:
+    """Refuse a scene without a wave image.
+
+    Raises:
+        NoWaveImage: it is one.
+    """
+    if why := WAVE_IMAGE.why_not(scene):
+        raise NoWaveImage(f"{why}, so that it has no wave image")
 
 
 def receiver_of(system: System, screen: Screen | PlacedScreen) -> Receiver:
