@@ -178,6 +178,7 @@ def refinement(
     how: Refinement,
     fewer: int = 1,
     spread: bool = False,
+    least: int = 0,
 ) -> list[Table]:
     """The default stages after a transport start, which is accurate at every scale: full resolution from the beginning.
 
@@ -188,11 +189,12 @@ def refinement(
         rays: of the last stage, None for the default of the quality.
         fewer: divisor of the default number of rays.
         spread: as for a stage; light that the source spreads beyond the screen is not an error.
+        least: of the rays, where `rays` does not say.
     """
     pixels, most, plan = math.prod(resolution), how.most_rays, how.plan
     if large := how.large_at(max(resolution)):
         most, plan = max(most, min(large.rays_per_pixel * pixels, large.most_rays)), large.plan or plan
-    rays = rays or max(LEAST_RAYS, min(most, how.rays_per_pixel * pixels) // fewer)
+    rays = rays or max(LEAST_RAYS, least, min(most, how.rays_per_pixel * pixels) // fewer)
     finer = max(1, min(how.subdivision, round(math.sqrt(rays / pixels))))
     apron = 0 if spread else math.ceil(0.04 * max(resolution))
     stages = []

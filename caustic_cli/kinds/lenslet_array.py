@@ -90,6 +90,11 @@ class LensletArray(OneSurface):
         return cls.pieces(d) != tuple(d.lens.array)
 
     @classmethod
+    def least_rays(cls, d: Defaults) -> int:
+        """One for each knot span, so that no step between lenslets hides between rays."""
+        return math.prod(d.lens.control) if cls._borders_cross(d) else 0
+
+    @classmethod
     def refinement(cls, d: Defaults, creased: bool = False) -> list[Table]:
         stages = super().refinement(d, creased)
         least = d.effort.borders if cls._borders_cross(d) else 0

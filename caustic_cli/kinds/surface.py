@@ -281,7 +281,12 @@ class OneSurface(Problem):
         """The stages after a transport start."""
         spread = cls.spread(d)
         how = d.effort.creased if creased else d.effort.refinement
-        return refinement(d.lens.control, d.rays, d.resolution, how, d.fewer_rays(spread), spread)
+        return refinement(d.lens.control, d.rays, d.resolution, how, d.fewer_rays(spread), spread, cls.least_rays(d))
+
+    @classmethod
+    def least_rays(cls, d: Defaults) -> int:
+        """Least number of rays of the stages after a transport start."""
+        return 0
 
     # Numerics
 

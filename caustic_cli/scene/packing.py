@@ -33,7 +33,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class PartAperture(Aperture):
-    """A part of a rectangle, of which the half widths are."""
+    """What is clear of an exit behind a rectangular pupil, whose half widths it has."""
 
     compiled: ClassVar[bool] = False
 
@@ -218,7 +218,7 @@ class HexagonalCells(Cells):
     @property
     def pieces(self) -> tuple[int, int]:
         """As of cells: their slanted borders do not follow knots."""
-        return (1, 1) if min(self.array[1], 2) > 1 else self.array
+        return (1, 1) if self.array[1] > 1 else self.array
 
     @property
     def radius(self) -> float:
