@@ -65,6 +65,7 @@ SLOW = (
     "test_sources_cli.py",
     "test_wave_design.py",
     "test_effects.py",
+    "test_lenslet_packing.py",
     "test_library.py",
     "test_machine.py",
     "test_noise.py",

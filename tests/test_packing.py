@@ -1,237 +1,108 @@
-"""How lenslets are packed: cells against the nearest centre, sections of splines, round lenslets, designs in hexagonal packing."""
+"""Compression of large control nets: lossless, and refused where the data are invalid."""
 
-import json
-import math
-import shlex
-from dataclasses import replace
+from __future__ import annotations
 
+import io
+import zlib
+
+import h5py
 import numpy as np
 import pytest
 import torch
-from helpers import write_blob
-from scipy.interpolate import BSpline
 
-import caustic_cli as caustic
-from caustic_cli import cli
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.lenslets import Section, array_objective, initial_array, lenslets, sampled
-from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.schedule import LossImage
+from caustic_cli.inverse.designer import State
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.scene.packing import ConvexAperture, cells_of
-from caustic_cli.studies.retrace import retrace
+from caustic_cli.project.checkpoint import Checkpoint, load, save, seal
+from caustic_cli.project.packing import LARGE, STEP, pack, rounded, unpack
 
-SIZES = [((5, 5), (10.0, 10.0)), ((4, 3), (9.0, 7.0)), ((1, 2), (3.0, 4.0)), ((3, 1), (6.0, 5.0)), ((2, 7), (1.0, 2.7))]
+SHAPES = [(1024, 1025), (2, 700, 800)]
 
 
-def hexagonal(array=(3, 2), size=(9.0, 6.0), control=(48, 40), resolution=(30, 25), **lens) -> Scene:
-    lens = {"packing": "hexagonal", "fresnel": "none"} | lens
-    made = Lens(size, control=control, array=array, offset=Offset(5.0), **lens)
-    return Scene(PlaneWave(), made, Screen((24.0, 20.0), 200.0, resolution))
+def net_of(shape, seed=0, size=5.0) -> np.ndarray:
+    """A smooth surface with creases, mm, in whole steps."""
+    x, y = np.meshgrid(*(np.linspace(-size, size, n) for n in shape[-2:]), indexing="ij")
+    plane = np.maximum(0.01 * x**2 + 0.02 * y, 0.003 * np.abs(x - y)) + 7.0
+    out = np.broadcast_to(plane, shape) + 1e-8 * np.random.default_rng(seed).normal(size=shape)
+    return rounded(torch.from_numpy(out)).numpy()
 
 
-def bumps(scene: Scene, seed=1, size=0.02) -> torch.Tensor:
-    """A smooth random net."""
-    rng = np.random.default_rng(seed)
-    x, y = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in scene.lens.control)
-    terms = ((3.0 * rng.random() * x[:, None], 3.0 * rng.random() * y[None, :]) for _ in range(4))
-    return 5.0 + size * sum(torch.sin(a + b) for a, b in terms)
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_a_net_comes_back_to_the_last_bit_from_few_bytes(shape):
+    net = net_of(shape)
+    packed = pack(net)
+    assert packed is not None and len(packed) < net.nbytes / 3
+    back = unpack(packed, shape)
+    assert back.dtype == net.dtype and (back == net).all() and (np.signbit(back) == np.signbit(net)).all()
 
 
-# Cells
+def test_beside_one_that_is_alike_it_takes_fewer():
+    net, like = net_of(SHAPES[0]), net_of(SHAPES[0], seed=1)
+    like = net + np.where(np.arange(SHAPES[0][1]) % 64 == 0, like - net, 0.0)
+    packed, alone = pack(net, like), pack(net)
+    assert packed is not None and alone is not None and len(packed) < 0.5 * len(alone)
+    assert (unpack(packed, net.shape, like) == net).all()
 
 
-@pytest.mark.parametrize(("array", "size"), SIZES)
-def test_a_hexagonal_cell_is_what_is_nearest_to_its_centre(array, size):
-    cells, rng = cells_of("hexagonal", array, size), np.random.default_rng(3)
-    at = (rng.random((2, 20_000)) - 0.5) * np.array(size)[:, None]
-    far = np.hypot(*(at[:, None] - np.array(cells.centres).T[:, :, None]))
-    assert (cells.number(*at) == far.argmin(0)).all()
-    assert (cells.number(*map(torch.from_numpy, at)).numpy() == far.argmin(0)).all()
-    for k in range(len(far)):
-        inside = ConvexAperture((size[0] / 2, size[1] / 2), cells.outline(k)).contains(*at)
-        assert (inside == (far.argmin(0) == k)).all()
-    assert far.min(0)[np.hypot(*at) < 1e-9 + cells.radius / 9].max(initial=0.0) < 2 * cells.radius
+def test_a_rounded_net_is_off_by_half_a_step():
+    net = torch.rand(1025, 1025, dtype=torch.float64)
+    assert 0.3 * STEP < (rounded(net) - net).abs().max() <= 0.5 * STEP
+    small = net[:100, :100]
+    assert rounded(small) is small
 
 
-@pytest.mark.parametrize("packing", ["square", "hexagonal"])
-@pytest.mark.parametrize(("array", "size"), SIZES)
-def test_cells_fill_the_array(packing, array, size):
-    cells = cells_of(packing, array, size)
-    areas = [ConvexAperture((size[0] / 2, size[1] / 2), cells.outline(k)).area for k in range(len(cells.centres))]
-    assert math.fsum(areas) == pytest.approx(math.prod(size), rel=1e-12)
-    assert len(areas) == math.prod(array)
-    for x, y in cells.centres:  # round lenslets lie in the array and do not overlap
-        assert abs(x) + cells.radius <= size[0] / 2 + 1e-12 and abs(y) + cells.radius <= size[1] / 2 + 1e-12
-    apart = [math.dist(a, b) for k, a in enumerate(cells.centres) for b in cells.centres[:k]]
-    assert min(apart, default=math.inf) >= 2 * cells.radius * (1 - 1e-12)
-
-
-def test_cells_inside_are_regular_hexagons():
-    cells = cells_of("hexagonal", (5, 5), (11.0, 11.0))  # of a width of 2
-    k = 2 * 5 + 2
-    corners = np.array(cells.outline(k)) - cells.centres[k]
-    assert len(corners) == 6
-    np.testing.assert_allclose(np.hypot(*corners.T), 2.0 / math.sqrt(3.0), rtol=1e-12)
-    area = ConvexAperture((5.5, 5.5), cells.outline(k)).area
-    assert math.pi * cells.radius**2 / area == pytest.approx(math.pi / (2.0 * math.sqrt(3.0)), rel=1e-12)
-
-
-def test_more_rows_than_fit():
-    with pytest.raises(InputError, match="room for 6 hexagonally packed rows on 10 x 10 mm, got 7"):
-        hexagonal((5, 7), (10.0, 10.0))
-    assert hexagonal((5, 6), (10.0, 10.0)).lens.cells.radius == pytest.approx(10.0 / 11.0)
-
-
-# Round lenslets
-
-
-@pytest.mark.parametrize(("packing", "fill"), [("square", math.pi / 4), ("hexagonal", 20 * math.pi / 4 * (8 / 5.5) ** 2 / 64)])
-def test_light_between_round_lenslets_is_absorbed(packing, fill):
-    """Of a plane wave and of a point far away, what leaves the lens is the fill factor."""
-    lens = Lens((8.0, 8.0), control=(25, 25), array=(5, 4) if packing == "hexagonal" else (4, 4), packing=packing, lenslets="round")
-    lens = replace(lens, fresnel="none", offset=Offset(5.0))
-    flat = torch.full(lens.control, 5.0, dtype=torch.float64)
-    for source in (PlaneWave(), Points(((0.0, 0.0, -1e7),))):
-        scene = Scene(source, lens, Screen((12.0, 12.0), 200.0, (40, 40)))
-        image, _ = retrace(scene, HeightField.of(lens), flat, None, rays=400_000, noise=False)
-        sent = 1.0 - image.lost["missed_lens"]
-        assert image.image.sum() / sent == pytest.approx(fill, abs=0.003)
-        assert image.lost["missed_surface"] / sent == pytest.approx(1.0 - fill, abs=0.003)
-
-
-# Sections
+@pytest.mark.parametrize("kind", ["small", "no whole steps", "large values", "not finite", "beside one of no whole steps"])
+def test_what_cannot_come_back_is_not_packed(kind):
+    net, like = net_of(SHAPES[0]), None
+    match kind:
+        case "small":
+            net = net[:100]
+        case "no whole steps":
+            net[3, 4] += 0.25 * STEP
+        case "large values":
+            net[3, 4] = 2.0**51 * STEP
+        case "not finite":
+            net[3, 4] = np.nan
+        case _:
+            like = net + 0.25 * STEP
+    assert (net.size < LARGE) == (kind == "small")
+    with np.errstate(invalid="ignore"):
+        assert pack(net, like) is None
 
 
 @pytest.mark.parametrize(
-    ("degree", "low", "high"), [(3, 0.25, 0.75), (2, 0.0, 0.375), (1, 0.125, 1.0), (3, 0.0, 1.0), (4, 0.5, 0.625)]
+    "data",
+    [b"", b"no zlib", zlib.compress(bytes(79)), zlib.compress(bytes(81)), zlib.compress(bytes(80))[:-6]],
+    ids=["empty", "not packed", "short", "long", "cut"],
 )
-def test_a_section_is_the_same_spline(degree, low, high):
-    whole = SplineSpace.uniform(8 + degree, degree)
-    net = torch.from_numpy(np.random.default_rng(2).normal(size=whole.n))
-    section = Section.of(whole, low, high)
-    own = net[section.where] if section.matrix is None else section.matrix @ net[section.where]
-    at = np.linspace(0.0, 1.0, 33)
-    expected = BSpline(whole.knots.numpy(), net.numpy(), degree)(low + (high - low) * np.clip(at, 1e-12, 1 - 1e-12))
-    np.testing.assert_allclose(section.space.matrix(torch.from_numpy(at)) @ own, expected, atol=1e-9)
-    assert (section.matrix is None) == (degree == 1 or (low, high) == (0.0, 1.0))
+def test_bytes_that_are_no_net_are_refused(data):
+    with pytest.raises(ValueError, match="net"):
+        unpack(data, (2, 5))
 
 
-def test_lenslets_are_sections_of_the_surface():
-    """Heights and slopes within each cell, and all of the light."""
-    scene = hexagonal()
-    net, field, rng = bumps(scene), HeightField.of(scene.lens), np.random.default_rng(4)
-    parts = lenslets(scene)
-    at = [torch.from_numpy((rng.random(2000) - 0.5) * w) for w in scene.lens.size]
-    number = scene.lens.cells.number(*at)
-    for k, one in enumerate(parts):
-        x, y = (c[number == k] for c in at)
-        u, v = x - one.middle[0], y - one.middle[1]
-        assert len(x) > 100 and bool(one.scene.lens.clear.contains(u, v).all())
-        for found, wanted in zip(one.field.at(one.of(net), u, v), field.at(net, x, y), strict=True):
-            np.testing.assert_allclose(found, wanted, atol=1e-10)
-    assert sum(one.share for one in parts) == pytest.approx(1.0, abs=1e-14)
-    areas = [ConvexAperture(scene.lens.half_size, scene.lens.cells.outline(k)).area / 54.0 for k in range(6)]
-    assert [one.share for one in parts] == pytest.approx(areas, rel=0.01)
+@pytest.fixture
+def saved(tmp_path):
+    net, start = (torch.from_numpy(net_of(SHAPES[0], seed)) for seed in (0, 1))
+    spaces = tuple(SplineSpace.uniform(n, 3) for n in net.shape)
+    made = Checkpoint(State(net, start=start, unrounded=start + STEP), spaces, {}, {})
+    save(tmp_path / "c.h5", made)
+    return tmp_path / "c.h5", made
 
 
-def test_the_gradient_by_each_lenslet_is_that_of_finite_differences():
-    scene = hexagonal((2, 2), (4.0, 4.0), (14, 14), (12, 12))
-    net, rng = bumps(scene, size=0.01), np.random.default_rng(1)
-    targets = [torch.from_numpy(rng.uniform(0.2, 1.0, (12, 12))) for _ in range(4)]
-    how = LossImage(Filter("cosine", (5, 5)))
-
-    def part(k, one):
-        return Objective(one.scene, one.field, rays_of(one.scene, "grid", 4000), targets[k], "rms", how, dtype=torch.float64)
-
-    loss = array_objective(lenslets(scene), part)
-    found, along = loss(net), torch.from_numpy(rng.normal(size=net.shape))
-    step = 1e-6
-    slope = (loss(net + step * along).loss - loss(net - step * along).loss) / (2.0 * step)
-    assert float((found.gradient * along).sum()) == pytest.approx(slope, rel=1e-3)
+def test_a_checkpoint_of_a_large_net_is_small_and_exact(saved):
+    path, made = saved
+    back = load(path).state
+    assert path.stat().st_size < 1.2 * made.state.heights.nbytes
+    for name in ("heights", "start", "unrounded"):
+        assert torch.equal(getattr(back, name), getattr(made.state, name))
 
 
-# Surfaces
-
-
-def test_surfaces_that_can_meet_do():
-    """Lenslets of one surface, raised at random, are that surface again, to the accuracy of a variation diminishing spline."""
-    scene = hexagonal((3, 2), (9.0, 6.0), (120, 90))
-    net, rng = bumps(scene), np.random.default_rng(3)
-    parts, field = lenslets(scene), HeightField.of(scene.lens)
-    made = sampled(parts, [one.of(net) + float(rng.normal()) for one in parts], scene.lens, field)
-    x, y = torch.meshgrid(*field.control_xy(), indexing="ij")
-    off = made.heights - field.at(net, x.reshape(-1), y.reshape(-1))[0].view(x.shape)
-    assert made.gap < 1e-11 and float(off.max() - off.min()) < 1e-11
-
-
-@pytest.mark.parametrize(
-    ("lenslets_", "source", "most"),
-    [("filled", PlaneWave(), 0.12), ("round", PlaneWave(), 0.1), ("filled", Points(((1.0, -2.0, -40.0),)), 0.2)],
-)
-def test_the_initial_surface(lenslets_, source, most):
-    """The picture by independent rays; a single lenslet's light, or none of the mask, would be far from it."""
-    x = np.linspace(-1.0, 1.0, 32)
-    goal = np.exp(-3.0 * (x[:, None] ** 2 + (x[None, :] - 0.2) ** 2)) + 0.2
-    lens = Lens((8.0, 8.0), index=1.5, control=(180, 180), array=(2, 2), packing="hexagonal", lenslets=lenslets_, fresnel="none")
-    scene = Scene(source, lens, Screen((24.0, 24.0), 120.0, (32, 32)))
-    heights = initial_array(scene, [goal], (180, 180), 128).heights
-    error = retrace(scene, HeightField.of(lens), heights, goal, rays=400_000)[1]["relative_rms"]
-    assert error < most
-
-
-# The program
-
-
-@pytest.fixture(scope="module")
-def arrays(tmp_path_factory):
-    """A directory with a hexagonal array, and one of round lenslets."""
-    directory = tmp_path_factory.mktemp("packed")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(directory)
-        write_blob()
-        common = "--packing hexagonal --resolution 24 --iterations 1 --quality draft --quiet --threads 2"
-        assert cli.run(shlex.split(f"design blob.png --array 2 {common}")) == 0
-        assert cli.run(shlex.split(f"design blob.png --array 2x1 --lenslets round -o round.caustic --lens-size 2 {common}")) == 0
-        yield directory
-
-
-def test_a_design_in_hexagonal_packing(arrays, monkeypatch, capfd):
-    monkeypatch.chdir(arrays)
-    lens = caustic.load("blob.caustic")
-    assert lens.scene.lens.packing == "hexagonal" and lens.scene.lens.pieces == (1, 1)
-    assert lens.figures["on_screen"] > 0.8
-    assert cli.run(shlex.split("render blob.caustic --rays 40000 --json --quiet --threads 2")) == 0
-    assert json.loads(capfd.readouterr().out)["on_screen"] == pytest.approx(lens.figures["on_screen"], abs=0.01)
-    assert cli.run(shlex.split("export blob.caustic --format stl --samples 40 --quiet")) == 0
-    assert "packing" in (arrays / "blob.caustic/project.toml").read_text()
-
-
-def test_a_design_of_round_lenslets(arrays, monkeypatch):
-    """Two of them in a row, of a square lens: half of its light, times pi / 4."""
-    monkeypatch.chdir(arrays)
-    lens = caustic.load("round.caustic")
-    assert lens.scene.lens.clear.area == pytest.approx(2.0 * math.pi * 0.25)
-    lit = lens.figures["on_screen"] / (1.0 - lens.figures["lost"]["fresnel"])
-    assert lit < math.pi / 8.0 * 1.1
-
-
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        ("design blob.png --packing hexagonal", "--array"),
-        ("design blob.png --lenslets round", "--array"),
-        ("design blob.png --array 4x9 --packing hexagonal", "hexagonally packed rows"),
-        ("design blob.png --array 2 --packing triangular", "hexagonal"),
-        ("export round.caustic --format mitsuba", "opaque mask"),
-        ("render round.caustic --html page.html", "opaque mask"),
-    ],
-)
-def test_refusals(line, said, arrays, monkeypatch, capfd):
-    monkeypatch.chdir(arrays)
-    code, err = cli.run(shlex.split(f"{line}")), capfd.readouterr().err
-    assert code == 2 and said in err and len(err.strip().splitlines()) == 1, err
+@pytest.mark.parametrize("shape", [(1024, 1026), (1 << 20, 1 << 20), (0, 5), (-1024, -1025), (1024,)], ids=str)
+def test_a_packed_net_of_a_wrong_shape_is_refused(saved, shape):
+    path, _ = saved
+    image = io.BytesIO(path.read_bytes()[512:])
+    with h5py.File(image, "r+") as f:
+        f["lens/heights"].attrs["shape"] = shape
+    path.write_bytes(seal(image.getvalue()) + image.getvalue())
+    with pytest.raises(InputError, match="damaged"):
+        load(path)
