@@ -544,7 +544,7 @@ def test_help_is_grouped_and_begins_with_the_basics(capfd, command):
     [
         ("design blob.png --magnification 3", "did you mean --mag?"),
         ("design blob.png --material PMMA", "did you mean --glass?"),
-        ("design blob.png --lens-sizes 3", "did you mean --lens-size or --screen-size?"),
+        ("design blob.png --lens-sizes 3", "did you mean --lens-size or --lenslets?"),
         ("render blob.caustic --output x.png", "did you mean --out?"),
         ("design -x.png", "a file whose name begins with a hyphen is given as ./-x.png"),
         ("design", "(caustic design --help says more)"),
