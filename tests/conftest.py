@@ -40,6 +40,7 @@ SLOW = (
     "test_batch.py",
     "test_cli.py",
     "test_convergence.py",
+    "test_curved_base.py",
     "test_design.py",
     "test_distribution.py",
     "test_effects_cli.py",

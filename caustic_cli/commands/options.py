@@ -377,14 +377,14 @@ def _place(option: str, text: str) -> str:
     return f"{name}:{numbers(option, distance, (1,), form=form, unit='mm')[0]:.15g}{comma}{azimuth}"
 
 
-def _radius(option: str, text: str) -> dict[str, Any]:
-    """Radii of a screen: "60" for a sphere; "60,inf" or "inf,60" for a cylinder."""
+def _radii(option: str, text: str) -> Any:
+    """Radii of a screen or a base surface: "60" for a sphere; "60,inf" or "inf,60" for a cylinder."""
     form = "one number of mm, or two with inf for straight, like 60, 60,inf or -8cm"
     parts = [part.strip() for part in text.split(",")]
     if len(parts) > 2:
         raise InputError(f"{option} must be {form}, got {text!r}")
     radii = (math.inf if part == "inf" else numbers(option, part, (1,), unit="mm", form=form)[0] for part in parts)
-    return {"screen.radius": both(tuple(radii))}
+    return both(tuple(radii))
 
 
 def _extent(option: str, text: str) -> tuple[tuple[float, ...], dict[str, Any]]:
@@ -461,7 +461,8 @@ READERS = {
     "lens.gradient_terms": _terms,
     "source.power": _power,
     "source.wavelengths": _spectrum,
-    "screen.radius": _radius,
+    "lens.radius": lambda option, text: {"lens.radius": _radii(option, text)},
+    "screen.radius": lambda option, text: {"screen.radius": _radii(option, text)},
     "screen.tilt": lambda option, text: {"screen.tilt": list(numbers(option, text, (2, 3), ",", "two or three angles like 20,0"))},
     "room.place": _sun,
     "rays": lambda option, text: {"rays": rays(option, text)},

@@ -32,6 +32,23 @@ _SECOND = (("second.file", "second.collimate", "second.focus"), ("second.collima
 #: {path} and {value} are those of the setting, {said} both of them, or the path of a flag alone, {default} its default, and
 #: {feature} the feature.
 EXCLUDED: dict[str, dict[str, str]] = {
+    "lens.base_file": {
+        "lens.radius": "⟨lens.base_file⟩ and ⟨lens.radius⟩ both give the base surface: give one of them",
+        **dict.fromkeys(
+            ("lens.mirror", "lens.gradient", "lens.array", *TRAITS["two sides"].settings),
+            "⟨lens.base_file⟩ is of a lens with one designed surface, without ⟨{path}⟩",
+        ),
+    },
+    "lens.entrance": {
+        "lens.mirror": "⟨lens.entrance⟩ parallel needs a lens: light never enters a mirror",
+        "lens.gradient": "⟨lens.entrance⟩ parallel cannot be combined with ⟨lens.gradient⟩, whose index counts from a flat side",
+        "lens.array": "⟨lens.entrance⟩ parallel is of one lens: on an array every lenslet has a base surface of its own",
+        "element": "⟨lens.entrance⟩ parallel" + NOT_BESIDE,
+        **dict.fromkeys(
+            TRAITS["two sides"].settings,
+            "⟨{path}⟩ designs the entrance, which ⟨lens.entrance⟩ parallel gives: one of them is possible",
+        ),
+    },
     "target.sheet": {"target.color": _SHEET},
     "target.color": {
         "source.each": "⟨source.each⟩ is not for a coloured picture",
@@ -71,6 +88,10 @@ EXCLUDED: dict[str, dict[str, str]] = {
 #: Feature -> settings of which it needs one -> message.
 NEEDED: dict[str, tuple[tuple[str, ...], str]] = {
     "target.sheet": (("lens.array",), _SHEET),
+    "lens.entrance": (
+        ("lens.radius", "lens.base_file"),
+        "⟨lens.entrance⟩ parallel needs ⟨+lens.radius⟩ or ⟨+lens.base_file⟩, the outer side",
+    ),
     "source.each": (("lens.array",), "⟨source.each⟩ needs ⟨+lens.array⟩, for each of whose lenslets there is a source"),
     "lens.packing": (("lens.array",), "⟨lens.packing⟩ is that of lenslets, which ⟨+lens.array⟩ makes"),
     "lens.lenslets": (("lens.array",), "⟨lens.lenslets⟩ is the shape of lenslets, which ⟨+lens.array⟩ makes"),

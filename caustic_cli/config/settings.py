@@ -23,7 +23,7 @@ from caustic_cli import __version__
 from caustic_cli.errors import InputError, alternatives, near
 from caustic_cli.io.files import read_bytes
 from caustic_cli.loading import OnDemand
-from caustic_cli.scene import COMPONENTS, Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
+from caustic_cli.scene import COMPONENTS, Component, FreeForm, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
 from caustic_cli.scene.aperture import Aperture, Pupil, larger
 from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.materials import refractive_index
@@ -50,7 +50,7 @@ from caustic_cli.schema.table import (
     in_section,
 )
 
-rooms = OnDemand("caustic_cli.scene.room")
+parallel, rooms = OnDemand("caustic_cli.optics.parallel"), OnDemand("caustic_cli.scene.room")
 
 #: Settings as given, by section and key.
 Given = dict[str, dict[str, Any]]
@@ -394,7 +394,7 @@ def build_lens(lens: LensSettings) -> Lens:
         lens.degree,
         None if lens.knots_u is None or lens.knots_v is None else (lens.knots_u, lens.knots_v),
         lens.min_thickness,
-        Offset(lens.thickness, lens.radius),
+        build_base(lens),
         lens.height_range,
         lens.fresnel,
         lens.absorption,
@@ -406,9 +406,37 @@ def build_lens(lens: LensSettings) -> Lens:
         lens.array,
         lens.packing,
         lens.lenslets,
+        entrance=build_entrance(lens),
         gradient=build_gradient(lens),
         crossing=lens.crossing,
     )
+
+
+def build_base(lens: LensSettings) -> Offset:
+    """The base surface of the [lens] section, from its file or its radii.
+
+    Raises:
+        InputError: the file was not read, or its face is smaller than the lens.
+    """
+    if "base_file" not in lens:
+        return Offset(lens.thickness, lens.radius)
+    base = content(lens, "base_file", Offset)
+    if base is None:
+        raise InputError(f"⟨lens.base_file⟩ {lens['base_file']!r} was not read: a STEP file of one face is needed")
+    base.check_size(lens.size)
+    return replace(base, thickness=lens.thickness)
+
+
+def build_entrance(lens: LensSettings) -> FreeForm | None:
+    """The entrance of the [lens] section, parallel to its base surface; None for a flat one.
+
+    Raises:
+        InputError: the wall is too thick for the base surface.
+    """
+    if check("lens.entrance", lens.entrance) == "flat":
+        return None
+    wall = lens.thickness - lens.z_in
+    return parallel.parallel_side(build_base(lens), wall, (0.5 * lens.size[0], 0.5 * lens.size[1]))
 
 
 def build_gradient(lens: LensSettings) -> Gradient | None:

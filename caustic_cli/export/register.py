@@ -25,7 +25,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.export import AS_CUT, SIDE_BY_SIDE
-from caustic_cli.export.milling import FACING, Milling
+from caustic_cli.export.milling import FACING, ROTARY, Milling
 from caustic_cli.export.part import BLOCK, Part, Register, alone, part_of, turned
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
@@ -43,7 +43,8 @@ def other(path: Path) -> Path:
 def parts_of(
     format: str, scene: Scene, field: HeightField, heights: Tensor, m: Milling, mould: bool = False, block: float | None = None
 ) -> tuple[Part, ...]:
-    """The parts that a format holds, each in a file: one, or the sides of a lens with two free-form ones, the exit first.
+    """The parts that a format holds, each in a file: one, or the sides of a lens with two curved ones, the exit first; of one that
+    is turned about the axis of a cylinder, whose inner side is there already, the exit alone.
 
     Args:
         m: see `sides_of`; mould, block: as of `part_of`.
@@ -52,7 +53,7 @@ def parts_of(
         InputError: as of `part_of` and `sides_of`.
     """
     one = part_of(format, scene, field, heights, mould, block)  # which refuses what contradicts the format
-    if scene.lens.entrance is None or not (mould or format in SIDE_BY_SIDE):
+    if scene.lens.entrance is None or m.path == ROTARY or not (mould or format in SIDE_BY_SIDE):
         return (one,)
     if mould:
         return halves_of(one, scene, m if format in AS_CUT else None, block)

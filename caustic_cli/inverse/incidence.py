@@ -31,6 +31,7 @@ from caustic_cli.inverse.transport import cell_means
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance, slopes_inside
 from caustic_cli.optics.media import medium_of
+from caustic_cli.optics.parallel import beyond_aperture
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
@@ -49,6 +50,8 @@ EDGE, PASSES = 65, 3
 STEEPEST = 0.6
 #: Most Newton iterations for (a, b), and their tolerance in parts of the half width of the lens.
 TRACED_STEPS, FOUND = 12, 1e-7
+#: What rounding may add to the distance from the axis of a ray at the edge of an aperture, as a part of it.
+ROUNDED = 1e-9
 #: Corners that are traced at a time, for their memory.
 CORNERS = 1 << 17
 #: A point and two beside it, along x and y, in the steps of finite differences.
@@ -70,8 +73,9 @@ def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
 
 
 def is_traced(scene: Scene) -> bool:
-    """Whether the light at the exit follows from its heights by rays: behind other lenses, or in a medium that bends them."""
-    return bool(scene.in_front) or medium_of(scene.lens).varies
+    """Whether the light at the exit follows from its heights by rays: behind other lenses or a curved entrance, or in a medium that
+    bends them."""
+    return bool(scene.in_front) or scene.lens.entrance is not None or medium_of(scene.lens).varies
 
 
 def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray | None = None) -> tuple[np.ndarray, tuple | None]:
@@ -90,8 +94,11 @@ class _WayToExit:
     @cached_property
     def systems(self) -> tuple[System, System]:
         """What lies before the glass, without and with the apertures of all lenses."""
-        whole = System.of(without_freeforms(self.scene))
+        whole, lens = System.of(without_freeforms(self.scene)), self.scene.lens
         count = [e.name for e in whole.elements].index(ENTRANCE) + 1
+        if lens.entrance is not None:
+            wider = replace(whole.elements[count - 1], surface=beyond_aperture(lens))
+            whole = replace(whole, elements=(*whole.elements[: count - 1], wider, *whole.elements[count:]))
         bare = without_apertures(whole, 0, count)
         return bare, replace(bare, elements=whole.elements[:count])
 
@@ -106,8 +113,8 @@ class _WayToExit:
         transmittance."""
         lens, state = self.scene.lens, self.entering(self.systems[0], at)
         entered, direction = (tuple(c.double() for c in state.full(v)) for v in (state.origin, state.direction))
-        depth = torch.from_numpy(z.ravel() - lens.z_in)
-        point, direction = medium_of(lens).onto_plane((*entered[:2], torch.zeros_like(depth)), direction, depth)
+        depth, below = torch.from_numpy(z.ravel() - lens.z_in), entered[2] + (state.datum - lens.z_in)
+        point, direction = medium_of(lens).onto_plane((*entered[:2], below), direction, depth)
         there, inside = (np.stack([c.numpy().reshape(z.shape) for c in v]) for v in (point[:2], direction))
         return there, inside, state.power.numpy().reshape(z.shape)
 
@@ -146,7 +153,7 @@ class _WayToExit:
         known = np.ones(z.size, dtype=bool)
         known[left] = False
         _, d, part = self.arrive(at, z)
-        part = part * (self.entering(self.systems[1], at).power.numpy() > 0.0)
+        part = part * (self.entering(self.systems[1], (1.0 - ROUNDED) * at).power.numpy() > 0.0)
         return np.concatenate([known[None], at, d, part[None]])
 
 
@@ -160,7 +167,7 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     known, part = known[0] > 0.0, part[0]
     ga, gb = (np.gradient(c, x, y) for c in at)
     power = part * np.abs(ga[0] * gb[1] - ga[1] * gb[0])
-    inside = np.all([far / r <= 1 + 1e-9 for far, r in pupil.aperture.distances(*at)], axis=0)
+    inside = np.all([far / r <= 1 + ROUNDED for far, r in pupil.aperture.distances(*at)], axis=0)
     power = np.where(known & inside, power, 0.0)
     power = power * _pupil_irradiance(scene, *at)
     goal = goal.reshape(2, *shape)

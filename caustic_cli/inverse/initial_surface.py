@@ -316,7 +316,7 @@ def first_surface(
         surface = _rough_surface(scene, target)
         grid = _Grid.of(scene, target, cells, surface)
         z = surface(*grid.places)
-    if scene.source.distant or lens.mirror or scene.elements:
+    if scene.source.distant or lens.mirror or scene.elements or lens.entrance is not None:
         found = None
         for _ in range(1 if scene.source.distant and not is_traced(scene) else PASSES):
             known = None if found is None else found.transport.potential

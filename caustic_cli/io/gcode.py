@@ -1,9 +1,9 @@
 """Reader of three-axis G-code programs (RS-274): linear moves, by tool.
 
-Supported are G0 and G1 with X, Y, Z in absolute millimetres (G21) or inches (G20), or with X, C, Z after a comment that names a
-tool of a lathe, one motion per block, without block delete; G17, G18, G90, G93, G94, F, S, M and N words are ignored; comments are
-in parentheses or after a semicolon.  Arcs, relative moves, cycles, offsets and parameters are refused, since the simulated cut
-would be wrong.
+Supported are G0 and G1 with X, Y, Z in absolute millimetres (G21) or inches (G20), with X, C, Z after a comment that names a tool
+of a lathe, or with X, A, Z after one that names a rotary axis, one motion per block, without block delete; G17, G18, G90, G93, G94,
+F, S, M and N words are ignored; comments are in parentheses or after a semicolon.  Arcs, relative moves, cycles, offsets and
+parameters are refused, since the simulated cut would be wrong.
 
 Comments of exported programs give the tool, the stock, and the orientation of the part: see `export.milling.gcode`.
 """
@@ -35,13 +35,15 @@ _COMMENT = re.compile(r"\([^()]*\)|;.*")
 _TOOL = re.compile(r"\(tool: (ball nose|flat end|drill|round nose), radius ([0-9.eE+-]+) mm")
 _STOCK = re.compile(r"\(stock: .*top at Z([0-9.eE+-]+)\)")
 _ZERO = re.compile(r"\(Z0: ([0-9.eE+-]+) mm")
+_ROTARY = re.compile(r"\(rotary: axis along ([xy] at z = [0-9.eE+-]+) mm")
 _TURNED = re.compile(r"\(turned: (yes|no)")
 
 
 @dataclass(frozen=True, eq=False)
 class Cut:
     """Path of one tool: kind (ball nose, flat end, drill, round nose, "" if unknown), radius, mm or None; positions of the tip
-    (k, 3) mm, of a tool of a lathe X, mm, C, radians, and Z, mm; rapid (k,), whether each was reached by G0."""
+    (k, 3) mm, of a tool of a lathe X, mm, C, radians, and Z, mm, beside a rotary axis X, A and Z; rapid (k,), whether each was
+    reached by G0."""
 
     kind: str
     radius: float | None
@@ -52,12 +54,14 @@ class Cut:
 @dataclass(frozen=True, eq=False)
 class Program:
     """cuts: paths by tool; top: height of the stock, mm, or None; zero: z of Z0 in the coordinates of the part, mm, or None;
-    turned: whether the (x, y, z) of the scene is (x, -y, -z) of the part, or None."""
+    turned: whether the (x, y, z) of the scene is (x, -y, -z) of the part, or None; rotary: the axis of A, x or y, and its z, mm, or
+    None."""
 
     cuts: tuple[Cut, ...]
     top: float | None
     zero: float | None
     turned: bool | None
+    rotary: tuple[str, float] | None = None
 
 
 class _Interpreter:
@@ -89,7 +93,7 @@ class _Interpreter:
         moved = False
         for letter, value in _WORD.findall(line):
             if letter in self.letters:
-                unit = math.radians(1.0) if letter == "C" else self.unit
+                unit = math.radians(1.0) if letter in "AC" else self.unit
                 self.position[self.letters.index(letter)] = float(value) * unit
                 moved = True
             else:
@@ -100,13 +104,13 @@ class _Interpreter:
             self.moves[-1].append((*self.position, self.motion == "G0"))
 
     def _comment(self, line: str, number: int) -> None:
-        for pattern in (_STOCK, _ZERO, _TURNED):
+        for pattern in (_STOCK, _ZERO, _TURNED, _ROTARY):
             if said := pattern.search(line):
                 self.comments[pattern] = said[1]
         if tool := _TOOL.search(line):
             self.tools.append((tool[1], _real(tool[2], number)))
             self.moves.append([])
-            self.letters = "XCZ" if tool[1] == LATHE else "XYZ"
+            self.letters = "XCZ" if tool[1] == LATHE else "XAZ" if _ROTARY in self.comments else "XYZ"
             self.position = [math.nan] * 3  # unknown after a tool change
 
     def _mode(self, letter: str, value: str, number: int) -> None:
@@ -139,7 +143,9 @@ def read_program(path: str | Path) -> Program:
         raise InputError(f"{path}: moves no tool; {ACCEPTED}")
     said = machine.comments
     top, zero = (_real(said[key], 0) if key in said else None for key in (_STOCK, _ZERO))
-    return Program(tuple(cuts), top, zero, said[_TURNED] == "yes" if _TURNED in said else None)
+    turns = said.get(_ROTARY, "").partition(" at z = ")
+    rotary = (turns[0], _real(turns[2], 0)) if _ROTARY in said else None
+    return Program(tuple(cuts), top, zero, said[_TURNED] == "yes" if _TURNED in said else None, rotary)
 
 
 def _real(text: str, number: int) -> float:

@@ -41,7 +41,7 @@ _STRING = re.compile(r"(?:'[^']*+')++|/\*(?:[^*]|\*(?!/))*+\*/|(?:'|/\*)(?s:.*)"
 _POINT = re.compile(
     r"#(\d{1,18})\s*+=\s*+CARTESIAN_POINT\s*+\(\s*+''\s*+,\s*+\(([^(),]*+),([^(),]*+),([^(),]*+)\)\s*+\)\s*+;", re.A
 )
-_SURFACE = "B_SPLINE_SURFACE_WITH_KNOTS"
+SPLINE = "B_SPLINE_SURFACE_WITH_KNOTS"
 _DEGREES = re.compile(r"\s*+\(\s*+''\s*+,\s*+(\d{1,4})\s*+,\s*+(\d{1,4})\s*+,\s*+\(", re.A)
 _ROW = re.compile(r"\s*+\(([#\d,\s]*+)\)\s*+(,?)", re.A)
 _FORM = re.compile(r"\s*+\)(?:\s*+,\s*+\.\w++\.){4}", re.A)
@@ -109,23 +109,40 @@ def read_step(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, 
     Raises:
         InputError: there is not exactly one surface, it is not such a height field, or the unit is another.
     """
-    text = read_bytes(path, MAX_STEP_BYTES, "a STEP file is needed").decode("latin-1")
     with naming(path):
-        if "ISO-10303-21" not in text[:1000]:
-            raise InputError("is not a STEP file, which begins with ISO-10303-21")
-        text = _STRING.sub("''", text)
-        if not re.search(r"SI_UNIT\s*+\(\s*+\.MILLI\.\s*+,\s*+\.METRE\.\s*+\)", text):
-            raise InputError("its lengths are not millimetres")
-        count = text.count(_SURFACE)
-        if count != 1 or "RATIONAL_B_SPLINE_SURFACE" in text:
-            raise InputError(f"must hold one B-spline surface, not rational, got {count} plain ones")
-        try:
-            poles, degrees, knots = _step_surface(text, text.index(_SURFACE) + len(_SURFACE))
-        except (ValueError, OverflowError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError("its B-spline surface is damaged") from error
-        return _of_this_size(_surface(poles, degrees, knots), half_size)
+        return _of_this_size(spline_in(step_text(path)), half_size)
+
+
+def step_text(path: Path) -> str:
+    """The text of a STEP file in millimetres, with empty strings and without comments.
+
+    Raises:
+        InputError: it cannot be read, or the unit is another.
+    """
+    text = read_bytes(path, MAX_STEP_BYTES, "a STEP file is needed").decode("latin-1")
+    if "ISO-10303-21" not in text[:1000]:
+        raise InputError("is not a STEP file, which begins with ISO-10303-21")
+    text = _STRING.sub("''", text)
+    if not re.search(r"SI_UNIT\s*+\(\s*+\.MILLI\.\s*+,\s*+\.METRE\.\s*+\)", text):
+        raise InputError("its lengths are not millimetres")
+    return text
+
+
+def spline_in(text: str) -> tuple[HeightField, Tensor]:
+    """The single B-spline surface in the text of a STEP file, see `read_step`.
+
+    Raises:
+        InputError: there is not exactly one, or it is not such a height field.
+    """
+    count = text.count(SPLINE)
+    if count != 1 or "RATIONAL_B_SPLINE_SURFACE" in text:
+        raise InputError(f"must hold one B-spline surface, not rational, got {count} plain ones")
+    try:
+        return _surface(*_step_surface(text, text.index(SPLINE) + len(SPLINE)))
+    except (ValueError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError("its B-spline surface is damaged") from error
 
 
 def _step_surface(text: str, at: int) -> tuple[np.ndarray, list[int], list[np.ndarray]]:

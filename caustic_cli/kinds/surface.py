@@ -157,7 +157,8 @@ class OneSurface(Problem):
             InputError: a value is out of range, or two contradict each other.
         """
         width = max(lens.size)
-        lens = lens.filled(thickness=0.0 if lens.mirror else width / 2.0 if width <= PLATE else WALL + width / 10.0)
+        thickness = 0.0 if lens.mirror else width / 2.0 if width <= PLATE else WALL + width / 10.0
+        lens = lens.filled(thickness=lens.z_in + WALL if lens.entrance == "parallel" else thickness)
         return lens.filled(height_range=(-width / 10.0, width / 10.0))
 
     @classmethod
@@ -433,7 +434,8 @@ class OneSurface(Problem):
             light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
             scene, goal = replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
         surface, lens = self.solved(scene, goal, cells, fixed, seconds), self.scene.lens
-        short = lens.floor - float(surface.heights.min())
+        floors = lens.floors(*(c.numpy() for c in self.field(0).control_xy()))
+        short = float((floors - surface.heights.numpy()).max())
         return replace(surface, heights=surface.heights + 1.01 * short) if fixed and short > 0 else surface
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:

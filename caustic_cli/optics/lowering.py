@@ -87,14 +87,16 @@ def _is_upright(element: Element, pupil: Pupil) -> bool:
 
 
 def _in_a_plane(rays: RayState) -> RayState:
-    """Rays as they cross the plane z = `datum`, on their lines: in front of the last surface nothing else happens to them."""
+    """Rays as they cross a plane, on their lines: in front of the last surface nothing else happens to them.  It is z = `datum`, or
+    as low as a ray begins, behind a curved entrance above whose edges the exit may lie lower."""
     x, y, z = rays.origin
     if isinstance(z, float):
         return rays
     rays = rays.expanded()
     dx, dy, dz = rays.direction
-    t = -z / dz
-    return replace(rays, origin=(x + t * dx, y + t * dy, 0.0))
+    low = min(0.0, float(z.min()))
+    t = (low - z) / dz
+    return replace(rays, origin=(x + t * dx, y + t * dy, low))
 
 
 def _are_plain(rays: RayState) -> bool:

@@ -26,6 +26,7 @@ from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.section import Attached
 from caustic_cli.schema.table import TABLE, Section, Setting
 
+faces = OnDemand("caustic_cli.io.faces")
 intensities, sags = OnDemand("caustic_cli.io.intensities"), OnDemand("caustic_cli.io.sags")
 spectrum = OnDemand("caustic_cli.scene.spectrum")
 rayfiles, spectra = OnDemand("caustic_cli.io.rayfiles"), OnDemand("caustic_cli.io.spectra")
@@ -160,6 +161,11 @@ def _index(path: Path, _given: Given) -> _Read:
     return _Read(read_bytes(path, MOST_INDEX, accepted), values, ".npy")
 
 
+def _base(path: Path, _given: Given) -> _Read:
+    """The base surface of a lens, from one face."""
+    return _Read(read_bytes(path, faces.MOST_BYTES, faces.ONE), faces.read_face(path), path.suffix.lower())
+
+
 def _sags(path: Path, _given: Given) -> _Read:
     data, heights = sags.read_sags(path)
     return _Read(data, heights, path.suffix.lower())
@@ -189,6 +195,7 @@ READERS: dict[str, Callable[[Path, Given], _Read]] = {
     "lamp.intensity": _intensity,
     "lamp.file": _rays,
     "source.spectrum": _spectrum,
+    "lens.base_file": _base,
     "lens.index_file": _index,
     "screen.shape_file": _sags,
     "second.file": _second,

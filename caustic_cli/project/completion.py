@@ -26,7 +26,7 @@ from caustic_cli.config.optional import (
     middle_source,
     stand,
 )
-from caustic_cli.config.settings import Given, Settings, build_screen, build_source, index_of
+from caustic_cli.config.settings import Given, Settings, build_base, build_screen, build_source, index_of
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.kinds import complete_design, kind_of
@@ -186,7 +186,7 @@ def complete_lens(s: Settings, source: Source) -> LensSettings:
     lowest, highest = (lens.thickness + height for height in lens.height_range)
     interaction = interaction_of(lens.mirror)
     interaction.check_room(z, lowest, highest)
-    if "radius" not in lens:
+    if not {"radius", "base_file"} & {*lens}:
         # The pictures of lenslets are superimposed: the light through their centres converges like that of a focusing lens.
         way = -1.0 if lens.crossing else 1.0
         across, along = (way * t / w if k == 1 else 0.0 for t, w, k in zip(s.target.size, lens.size, array, strict=True))
@@ -208,7 +208,7 @@ def _missing_room(lens: LensSettings) -> float:
     A strongly converging lens, for a close source for instance, is thinnest at its corners.
     """
     x, y = (np.array([0.0, width / 2.0]) for width in lens.size)
-    lowest = lens.thickness + float(Offset(0.0, lens.radius).sag(x[:, None], y[None, :]).min())
+    lowest = lens.thickness + float(build_base(lens).sag(x[:, None], y[None, :]).min())
     short = interaction_of(lens.mirror).base(lens.z_in) + lens.min_thickness - lowest
     return short if short >= lens.height_range[1] else 0.0
 

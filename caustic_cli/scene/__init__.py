@@ -96,10 +96,10 @@ class Scene:
         self.lens.interaction.check_screen(self.screen.z, self.lens.z_in)
         self.screen.check_curvature()
         self.screen.check_facing(self.undeviated)
-        if self.source.nearest >= min(self.lens.z_in, self.lens.pupil.z):
+        begins, what = (self.lens.z_in, "z_in =") if self.lens.entrance is None else (self.lens.lowest, "all of its inner side,")
+        if self.source.nearest >= min(begins, self.lens.pupil.z):
             raise InputError(
-                f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
-                f" got z = {self.source.nearest:g} mm"
+                f"⟨source.position⟩ must lie before the lens (z below {what} {begins:.6g} mm), got z = {self.source.nearest:g} mm"
             )
         if self.dispersive and self.light.measure is None:
             for wavelength in self.light.wavelengths:

@@ -79,7 +79,7 @@ class Offset:
             if square.max(initial=0.0) >= rho * rho:
                 raise InputError(
                     f"⟨lens.radius⟩ must exceed the lens' semi-aperture of {math.sqrt(square.max()):.4g} mm, got {abs(rho):.4g} mm"
-                    " (a smaller ⟨mag⟩ or a longer ⟨throw⟩ gives a larger radius)"
+                    " (where it is derived, a smaller ⟨mag⟩ or a longer ⟨throw⟩ gives a larger radius)"
                 )
             # s / (rho + sign sqrt(rho^2 - s)), which is rho - sign sqrt(rho^2 - s) without cancellation
             root = rho * rho - square
@@ -88,6 +88,23 @@ class Offset:
             root += rho
             total += np.divide(square, root, out=root)
         return total
+
+    def slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes of f along x and y at points x, y of one shape; raises as `sag`."""
+        (rx, ry), _ = self.radius, self.sag(x, y)
+        across, along = (x * x + y * y,) * 2 if rx == ry else (x * x, y * y)
+        sx, sy = (
+            np.zeros_like(c) if math.isinf(rho) else math.copysign(1.0, rho) * c / np.sqrt(rho * rho - square)
+            for c, square, rho in ((x, across, rx), (y, along, ry))
+        )
+        return sx, sy
+
+    def check_size(self, size: tuple[float, float]) -> None:
+        """Check that it covers a lens of this size, mm: radii are checked where heights are taken."""
+
+    def scaled(self, factor: float) -> Offset:
+        """Larger by a factor."""
+        return Offset(factor * self.thickness, larger(self.radius, factor))
 
     def heights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """f on the grid of points x (n,), y (m,): (n, m) float64 mm; raises as `sag`."""
@@ -269,8 +286,15 @@ class Lens:
 
     @property
     def floor(self) -> float:
-        """z that no control height must fall below, mm: by the least thickness of a lens; a mirror has none."""
+        """z that no control height must fall below, mm: by the least thickness of a lens with a flat entrance; a mirror has
+        none."""
         return self.interaction.base(self.z_in) + self.min_thickness
+
+    def floors(self, x: np.ndarray, y: np.ndarray) -> np.ndarray | float:
+        """The same at control points x (n,), y (m,), mm: the least thickness above the entrance there, or one for all, (n, m)."""
+        if self.entrance is None:
+            return self.floor
+        return self.floor + self.entrance.at(x / self.half_size[0], y / self.half_size[1])
 
     @property
     def interior(self) -> Interior:
@@ -298,7 +322,7 @@ class Lens:
             size=larger(self.size, factor),
             z_in=factor * self.z_in,
             min_thickness=factor * self.min_thickness,
-            offset=Offset(factor * self.offset.thickness, larger(self.offset.radius, factor)),
+            offset=self.offset.scaled(factor),
             height_range=larger(self.height_range, factor),
             absorption=self.absorption / factor,
             border=factor * self.border,
@@ -310,13 +334,14 @@ class Lens:
     def height_bounds(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the control heights at control points x (n,), y (m,): two (n, m) float64, mm.
 
-        With every height at least `floor` the whole surface is, too, by the convex hull property (4.1.2).
+        With every height at least `floor` the whole surface is, too, by the convex hull property (4.1.2); above a curved
+        entrance, as far as the control points follow it.
 
         Raises:
             InputError: the lower bound exceeds the upper one somewhere.
         """
         f = self.offset.heights(x, y)
-        low = np.maximum(f + self.height_range[0], self.floor)
+        low = np.maximum(f + self.height_range[0], self.floors(x, y))
         high = f + self.height_range[1]
         if not (low < high).all():
             raise InputError(

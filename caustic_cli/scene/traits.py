@@ -45,8 +45,8 @@ class Trait:
 TRAITS: Mapping[str, Trait] = {
     "mirror": Trait("a mirror", lambda s: s.lens.mirror, ("lens.mirror",)),
     "gradient index": Trait("an index that varies", lambda s: s.lens.gradient is not None, ("lens.gradient",)),
-    "two sides": Trait("a free-form entrance", lambda s: s.two_sided, ("second.file", "second.collimate", "second.focus")),
-    "designed entrance": Trait("a designed free-form entrance", lambda s: s.lens.entrance is not None),
+    "two sides": Trait("a curved entrance", lambda s: s.two_sided, ("second.file", "second.collimate", "second.focus")),
+    "designed entrance": Trait("a given curved entrance", lambda s: s.lens.entrance is not None),
     "other elements": Trait("other elements beside it", lambda s: bool(s.unfolded.elements), ("element.reshapes",)),
     "folded axis": Trait("an axis folded by flat mirrors", lambda s: s.unfolded is not s),
     "lenslet array": Trait("lenslets", lambda s: s.lens.arrayed, ("lens.array",)),

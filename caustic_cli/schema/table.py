@@ -345,13 +345,23 @@ class LensSettings(Section):
     z_in: float = setting("position of the plane entrance, or reference plane of a free-form one", "mm", -checks.LENGTH,
             checks.LENGTH, default=0.0, why="the origin of the lens")
     thickness: float = setting("centre height of the base surface above the lens' origin", "mm", -checks.LENGTH, checks.LENGTH,
-            derived="half the width of a lens up to 20 mm; for a wider one, a least wall of 3 mm; with two free-form sides twice"
-            " the width; 0 of a mirror", why="table D.2 of the thesis; a plate is thin; two sides need a distance",
+            derived="half the width of a lens up to 20 mm; for a wider one, a least wall of 3 mm; with a parallel entrance a wall"
+            " of 3 mm; with two free-form sides twice the width; 0 of a mirror", why="table D.2 of the thesis; a plate is thin; two"
+            " sides need a distance",
             option=Option("--thickness", "MM"))
-    radius: Pair = setting("radii of the base surface along x and y; inf is flat, positive is diverging", "mm",
-            derived="the sphere that spreads the light over the picture", why="table 6.1 of the thesis")
-    height_range: Pair = setting("least and largest height above the base surface", "mm", -checks.LENGTH, checks.LENGTH,
-            derived="a tenth of the lens' width, or what the first surface needs")
+    radius: Pair = setting("radii of curvature of the base surface along x and y: the same for a sphere, inf along one axis for a"
+            " cylinder; positive is diverging, with edges towards +z, negative the outer side of a tube or dome", "mm",
+            derived="the sphere that spreads the light over the picture", why="table 6.1 of the thesis",
+            option=Option("--base-radius", "R[,RY]"))
+    base_file: str | None = setting("STEP file of the base surface, of which the project keeps a copy: one cylindrical, spherical"
+            " or B-spline face, whose vertex is moved to the thickness", derived="the base surface of lens.radius",
+            option=Option("--base-file", "FILE.step"), file="base")
+    height_range: Pair = setting("limits of the relief: least and largest height of the exit above the base surface", "mm",
+            -checks.LENGTH, checks.LENGTH, derived="a tenth of the lens' width, or what the first surface needs",
+            option=Option("--relief", "LOW,HIGH"))
+    entrance: str = setting("inner side of the lens: flat, or parallel to the base surface (concentric), at the wall's thickness,"
+            " like that of a tube, a dome or a bent pane", choices=("flat", "parallel"), default="flat", written=False,
+            option=Option("--entrance", "flat|parallel"))
     min_thickness: float = setting("least wall thickness, from z_in to the exit", "mm", 0.0, checks.LENGTH, default=1.0,
             why="a wall that can be machined and mounted", option=Option("--min-thickness", "MM"))
     index: float = setting("refractive index", low=1.0, high=5.0, above=True, default=1.5443, written=False,

@@ -176,7 +176,9 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -
     low, high, slope, bent = (float(m) for m in torch.stack(found).amax(0) * torch.tensor([-1.0, 1.0, 1.0, 1.0]))
     depths, reflected = f"{high - low:.2g} mm deep", ""
     if not lens.mirror:
-        depths = f"wall {low - lens.z_in:.2f} mm, stock {high - lens.z_in:.2f} mm"
+        flat = {"wall": low - lens.z_in, "stock": high - lens.z_in}
+        wall, stock = (flat if lens.entrance is None else wall_and_stock(scene, field, heights)).values()
+        depths = f"wall {wall:.2f} mm, stock {stock:.2f} mm"
         reflected = f" (light along the axis is totally reflected from {1.0 / math.sqrt(lens.index**2 - 1.0):.2f})"
     return (
         f"first surface: {depths}, slopes up to {slope:.2g}{reflected},"
@@ -190,7 +192,7 @@ THROW = Capability(
     {
         "tilted light": "the throw is not along the axis",
         "near source": "the relief collects the light of the source, whatever the throw",
-        "mirror": "its relief is not that of a sheet",
+        **dict.fromkeys(("mirror", "two sides"), "its relief is not that of a sheet"),
         "other elements": "they decide the throw, too",
         "far field": "there is none",
     },

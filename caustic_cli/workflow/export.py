@@ -16,7 +16,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError, alternatives
 from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES, SIDE_BY_SIDE
-from caustic_cli.export.milling import Milling
+from caustic_cli.export.milling import ROTARY, Milling
 from caustic_cli.export.part import Part, part_of, turned
 from caustic_cli.export.reading import Reading, Readings
 from caustic_cli.export.register import other, parts_of, registered, with_stock
@@ -275,7 +275,8 @@ def export(
     began = time.monotonic()
     which = "" if at is None else f"-{at.replace(' ', '').replace(',', '-').replace('=', '-')}"
     path = output or Path(opened.path.resolve().stem + which + FORMATS[format][0])
-    written = files(path, exporter.scene, format, script, given.get("mould", False))
+    rotary = (given.get("milling") or {}).get("path") == ROTARY
+    written = files(path, exporter.scene, format, script, given.get("mould", False), rotary)
     printer = finishing.printer(opened.settings.lens.finish)
     if printer is not None and "printer" in getattr(_home(format), "MORE", ()):
         given = {"printer": printer} | given
@@ -367,9 +368,9 @@ def _scallops(scene: Scene, field: HeightField, found: dict) -> dict:
     return import_module("caustic_cli.studies.scallops").scallops(scene, found["step_over_mm"], found["tool_radius_mm"])
 
 
-def files(path: Path, scene: Scene, format: str, script: bool = False, mould: bool = False) -> list[Path]:
-    """All files of an export, the lens first."""
-    both = scene.lens.entrance is not None and (mould or format in SIDE_BY_SIDE)
+def files(path: Path, scene: Scene, format: str, script: bool = False, mould: bool = False, rotary: bool = False) -> list[Path]:
+    """All files of an export, the lens first; rotary: a program for a mill with a rotary axis."""
+    both = scene.lens.entrance is not None and (mould or format in SIDE_BY_SIDE) and not rotary
     paths = [path, other(path)] if both else [path]
     if format == "heightmap":
         return [name for p in paths for name in (p, beside(p))]

@@ -21,6 +21,8 @@ from caustic_cli.scene import Aperture, Scene
 POINTS = 400_000
 #: Oversampling of a wave image, since scallops scatter light beside the screen.
 FINER = 1.5
+#: Longest move of a rotary axis, rad, that is taken for straight: of 60 mm a nanometre off.
+TURN = 3e-4
 #: Largest deviation over the size of the part; beyond it, the program is for another part.
 FAR = 0.05
 
@@ -41,6 +43,10 @@ def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float
             continue
         if radius is None:
             raise InputError(f"{path}: does not give the radius of its ball-nose tool; ⟨tool_radius⟩ is needed")
+        if program.rotary is not None:
+            centres = _around(cut.tips, radius, *program.rotary)
+            envelopes.append(Envelope(radius, centres[:-1], centres[1:]))
+            continue
         if cut.kind == LATHE:
             envelopes.append(NoseEnvelope(radius, cut.tips))
             continue
@@ -49,9 +55,21 @@ def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float
         envelopes.append(Envelope(radius, *_near(centres, top + radius), top=top))
     if not envelopes:
         raise InputError(f"{path}: has no ball-nose tool, the only kind that is simulated")
+    if program.rotary is not None:
+        return CutSurface(tuple(envelopes), field.half_size)
     turned = scene.lens.cut_from < 0 if program.turned is None else program.turned
     zero = scene.lens.z_in if program.zero is None else program.zero
     return CutSurface(tuple(envelopes), field.half_size, -zero if turned else zero, turned)
+
+
+def _around(tips: np.ndarray, radius: float, along: str, axis: float) -> np.ndarray:
+    """Centres (k, 3) of a ball, mm, in the coordinates of the scene, from X, A, Z of its tip around an axis along x or y at
+    z = axis: X, Y, Z is x, y, z or y, -x, z there, and at A the tip is at Y = -Z sin A.  Moves of A are divided into short ones."""
+    parts = np.maximum(1, np.ceil(np.abs(np.diff(tips[:, 1])) / TURN)).astype(int)
+    place = np.concatenate([*(k + np.arange(n) / n for k, n in enumerate(parts)), [len(parts)]])
+    x, a, z = (np.interp(place, np.arange(len(tips)), c) for c in tips.T)
+    across, height = (z + radius) * np.sin(a), (z + radius) * np.cos(a) + axis
+    return np.stack([across, x, height] if along == "y" else [x, -across, height], -1)
 
 
 def _near(centres: np.ndarray, top: float) -> tuple[np.ndarray, np.ndarray]:

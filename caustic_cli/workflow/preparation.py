@@ -32,7 +32,7 @@ from caustic_cli.schema.table import TABLE, LensSettings
 from caustic_cli.workflow.compilation import announce_compilation, compile_design
 from caustic_cli.workflow.reporter import Reporter
 
-surfaces = OnDemand("caustic_cli.io.surfaces")
+relief, surfaces = OnDemand("caustic_cli.inverse.relief"), OnDemand("caustic_cli.io.surfaces")
 
 #: Most of a time limit for the initial surface.
 START_PART = 0.3
@@ -42,12 +42,13 @@ MISPLACED = 0.03
 
 class PreparedDesign(NamedTuple):
     """A design about to be run: its project, its problem, None where it exists already, its initial heights, None for the offset
-    surface, and the part of the light that their transport left in wrong places."""
+    surface, the part of the light that their transport left in wrong places, and what is to be said of their relief."""
 
     project: Project
     problem: OneSurface | None = None
     first: InitialHeights | None = None
     misplaced: float = 0.0
+    relief: str = ""
 
     @property
     def scene(self) -> Scene:
@@ -110,6 +111,8 @@ def prepare(
             f"the transport left {prepared.misplaced:.1%} of the light in wrong places: the design starts from a poorer surface"
             " than usual, and may end with a larger error"
         )
+    if prepared.relief:
+        say.say(prepared.relief)
     if out is not None:
         directory.create(prepared.project, force)
     return prepared
@@ -140,13 +143,19 @@ def first_heights(project: Project, said: Given, problem: OneSurface) -> Prepare
         project, problem = _with_lens(project, problem, **room)
         if middle is None:
             first = solved(project, problem, fixed)
-    return _prepared(project, problem, first)
+    return _prepared(project, problem, first, limited="height_range" in said.get("lens", {}))
 
 
-def _prepared(project: Project, problem: OneSurface, first: InitialSurface | None) -> PreparedDesign:
-    """A design that starts from a surface."""
+def _prepared(project: Project, problem: OneSurface, first: InitialSurface | None, limited: bool = False) -> PreparedDesign:
+    """A design that starts from a surface; limited: whether the user gave limits of its relief, between which it is placed."""
     heights, misplaced = (None, 0.0) if first is None else (first.heights, first.misplaced)
-    return PreparedDesign(project, problem, Designer(problem).initial_heights(heights), misplaced)
+    words = ""
+    if limited and heights is not None:
+        moved, lacking = relief.placed(heights.numpy(), *(limit.numpy() for limit in problem.bounds(0)))
+        heights = torch.from_numpy(moved)
+        if lacking:
+            words = relief.words(problem.scene, problem.field(0), moved, lacking, project.settings.target.size)
+    return PreparedDesign(project, problem, Designer(problem).initial_heights(heights), misplaced, words)
 
 
 def solved(project: Project, problem: OneSurface, fixed: bool, rough: bool = False) -> InitialSurface | None:
@@ -190,7 +199,7 @@ def _with_lens(project: Project, problem: OneSurface, **values: Any) -> tuple[Pr
 
 def _is_plate(lens: LensSettings) -> bool:
     """Whether the thickness follows from the depth of the surface and a wall behind it."""
-    return not lens.mirror and max(lens.size) > PLATE
+    return not lens.mirror and lens.entrance == "flat" and max(lens.size) > PLATE
 
 
 def _spare(lens: LensSettings, said: Given, first: torch.Tensor) -> float:
@@ -206,7 +215,7 @@ def _room(given: LensSettings, said: Given, first: torch.Tensor) -> dict[str, An
     x, y = (c.numpy() for c in offset.control_xy())
     base = lens.offset.heights(x, y)
     departure = 2.0 * float(np.abs(first.numpy() - base).max())
-    short = lens.floor - float(first.min())
+    short = float((lens.floors(x, y) - first.numpy()).max())
     fixed, changed = said.get("lens", {}), dict[str, Any]()
     if departure > lens.height_range[1] and "height_range" not in fixed:
         changed["height_range"] = (-departure, departure)

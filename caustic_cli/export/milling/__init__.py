@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, fields
 from caustic_cli.errors import InputError
 from caustic_cli.schema import checks
 
-#: Path of a lathe, and all.
-TURNING = "turning"
-PATHS = ("raster", "raster-y", "spiral", TURNING)
+#: Path of a lathe, of a mill with a rotary axis, and all.
+TURNING, ROTARY = "turning", "rotary"
+PATHS = ("raster", "raster-y", "spiral", ROTARY, TURNING)
 #: Parameters of mills alone, and of lathes alone.
 MILLED = ("feed", "spindle", "roughing", "roughing_tool", "roughing_radius", "allowance")
 TURNED = ("clearance", "revolutions")
@@ -47,7 +47,8 @@ class Milling:
     step_over: float | None = _setting(None, "Distance between passes instead.", "mm", 1e3)
     path: str = _setting(
         "raster",
-        "raster (along x), raster-y, or spiral from the middle outwards; turning: X, C, Z of a lathe with a tool servo.",
+        "raster (along x), raster-y, or spiral from the middle outwards; rotary: X, A, Z of a mill with a rotary axis, on the"
+        " outside of a cylinder; turning: X, C, Z of a lathe with a tool servo.",
         choices=PATHS,
     )
     dialect: str = _setting(
@@ -61,7 +62,10 @@ class Milling:
     clearance: float = _setting(10.0, "turning: Clearance angle of the tool.", "deg", 89.0)
     revolutions: float = _setting(60.0, "turning: Speed of the part.", "1/min")
     stock: float | None = _setting(
-        None, "Height of the stock above Z0, the flat face.  [default: the highest point and 0.1 to 0.2 mm]", "mm", 1e4
+        None,
+        "Height of the stock above Z0, the flat face, or the axis of a cylinder.  [default: the highest point and 0.1 to 0.2 mm]",
+        "mm",
+        1e4,
     )
     roughing: float | None = _setting(None, "Rough first, in layers of at most this depth.  [default: no roughing]", "mm", 1e3)
     roughing_tool: str = _setting("flat", "Tool that roughs: ball or flat.", choices=TOOLS)

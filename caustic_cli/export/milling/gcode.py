@@ -17,18 +17,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from dataclasses import field as made
 from pathlib import Path
 
 import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.milling import TURNING, Milling
+from caustic_cli.export.milling import ROTARY, TURNING, Milling
 from caustic_cli.export.milling.offset import BallOffset, FlatOffset, shape_of
 from caustic_cli.export.milling.paths import batches, raster, spacing, spiral, with_heights
+from caustic_cli.export.milling.rotary import write_rotary
 from caustic_cli.export.milling.turning import write_turning
+from caustic_cli.export.milling.writer import (
+    COUNTED,
+    FIRST_MOVE,
+    LEAST_DIGITS,
+    MORE_DIGITS,
+    MOST_OVER,
+    PATH_PART,
+    Writer,
+    begin,
+    descend,
+)
 from caustic_cli.export.part import Part, Register
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
@@ -37,84 +47,12 @@ from caustic_cli.scene import Aperture
 from caustic_cli.schema import checks
 from caustic_cli.schema.checks import LENGTH
 
-#: Tolerance of the path over the scallop height; digits of a coordinate beyond those of the tolerance; least number of digits.
-PATH_PART, MORE_DIGITS, LEAST_DIGITS = 0.01, 1, 4
-#: Largest overrun of the passes beyond the aperture, over the tool radius.
-MOST_OVER = 0.7
-#: Length of the initial moves of a path over the radius, at most a knot span.
-FIRST_MOVE = 0.125
 #: Roughing: step-over over the radius, tolerance over the allowance.
 ROUGH_STEP, ROUGH_PART = 0.5, 0.05
 #: Depth of the holes for pins, in their diameters, and what is left below them at least, in parts of the stock.
 HOLE, FLOOR = 3.0, 0.1
 #: mm of an inch.
 INCH = 25.4
-#: Rapid feed for the estimated time, mm/min: mills have 3 to 30 m/min.
-RAPID = 3000.0
-#: Reserved length of the comment with the number of lines and the time, which is written last.
-COUNTED = 100
-
-
-@dataclass
-class _Writer:
-    """Writes moves and accumulates lines, length and time.
-
-    digits: of coordinates, in the unit of the program, of `unit` mm; simple: rapid moves are linear ones, and all have their feed.
-    """
-
-    file: object
-    digits: int
-    unit: float = 1.0
-    simple: bool = False
-    lines: int = 0
-    minutes: float = 0.0
-    length: float = 0.0
-    at: tuple[float, float, float] | None = None
-    feed: float = 0.0
-    forms: list[str] = made(default_factory=list)
-
-    def __post_init__(self):
-        words = [f"{letter}%.{self.digits}f" for letter in "XYZ"]
-        self.forms = [" ".join(w for k, w in enumerate(words) if mask >> k & 1) for mask in range(8)]
-
-    def say(self, *lines: str) -> None:
-        self.file.write("".join(f"{line}\n" for line in lines).encode("ascii"))
-        self.lines += len(lines)
-
-    def rapid(self, x: float | None = None, y: float | None = None, z: float | None = None) -> None:
-        """Rapid move (G0) in x and y, or in z."""
-        word, feed = ("G1", f" F{RAPID / self.unit:.6g}") if self.simple else ("G0", "")
-        to_there = self.forms[3] % (x / self.unit, y / self.unit) if x is not None else self.forms[4] % (z / self.unit)
-        self.say(f"{word} {to_there}{feed}")
-        before = self.at or (x or 0.0, y or 0.0, z or 0.0)
-        to = (before[0] if x is None else x, before[1] if y is None else y, before[2] if z is None else z)
-        self.minutes += math.dist(before, to) / RAPID
-        self.at = to
-
-    def cut(self, points: np.ndarray, feed: float) -> None:
-        """Linear moves (G1) through points (m, 3), mm; unchanged coordinates are omitted."""
-        points = np.round(points / self.unit, self.digits) + 0.0
-        before = np.concatenate([[np.asarray(self.at) / self.unit], points[:-1]])
-        changed = points != before
-        moved = changed.any(1)
-        points, before, changed = points[moved], before[moved], changed[moved]
-        if not len(points):
-            return
-        masks = (changed @ [1, 2, 4]).tolist()
-        words = f" F{feed / self.unit:.6g}"
-        rows = [
-            "G1 " + self.forms[mask] % tuple(v for v, c in zip(row, kept, strict=True) if c)
-            for mask, row, kept in zip(masks, points.tolist(), changed.tolist(), strict=True)
-        ]
-        if self.simple:
-            rows = [row + words for row in rows]
-        elif feed != self.feed:
-            rows[0] += words
-        self.feed = feed
-        self.file.write(("\n".join(rows) + "\n").encode("ascii"))
-        long = float(np.linalg.norm(points - before, axis=1).sum()) * self.unit
-        self.lines, self.length, self.minutes = self.lines + len(rows), self.length + long, self.minutes + long / feed
-        self.at = tuple((points[-1] * self.unit).tolist())
 
 
 def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, tolerance: float | None = None) -> dict:
@@ -136,6 +74,8 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     unit, simple = INCH if m.dialect.endswith("inch") else 1.0, m.dialect.startswith("simple")
     if m.path == TURNING:
         return write_turning(path, part, m, tolerance, unit, simple)
+    if m.path == ROTARY:
+        return write_rotary(path, part, m, tolerance, unit, simple)
     field, heights = part.field, part.heights - base  # from here on Z0 is the flat face
     low, high, slope, concave = shape_of(field, heights)
     step = m.step(concave, slope)
@@ -150,17 +90,17 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
     passes = spiral(outline, step) if m.path == "spiral" else raster(outline, step, lines[m.path])
     with atomic_file(path) as file:
-        out = _Writer(file, digits, unit, simple)
+        out = Writer(file, digits, unit, simple)
         out.say(*_head(part, m, step, scallop, top, digits, tolerance))
         place = file.tell()
         out.say(" " * COUNTED, f"{'G21' if unit == 1.0 else 'G20'} G90 G17 G94")
         if part.register is not None and part.register.drills(part.turned):
             _drill(out, m, part.register, safe)
         if m.roughing is not None:
-            _begin(out, m.roughing_tool, m.rough_radius, m.spindle, safe)
+            begin(out, m.roughing_tool, m.rough_radius, m.spindle, safe)
             _rough(out, m, field, heights, part.lens.opening, top, low, safe)
             out.say("M5", "M0 (change the tool)")
-        _begin(out, "ball", m.tool_radius, m.spindle, safe)
+        begin(out, "ball", m.tool_radius, m.spindle, safe)
         _finish(out, m, field, heights, passes, top, tolerance)
         out.rapid(z=safe)
         out.say("M5", "M30")
@@ -214,33 +154,18 @@ def _head(part: Part, m: Milling, step: float, scallop: float, top: float, digit
     ]
 
 
-def _drill(out: _Writer, m: Milling, register: Register, safe: float) -> None:
+def _drill(out: Writer, m: Milling, register: Register, safe: float) -> None:
     """Write the holes for the dowel pins, from above, not through the stock."""
-    _begin(out, "drill", 0.5 * register.pin, m.spindle, safe)
+    begin(out, "drill", 0.5 * register.pin, m.spindle, safe)
     for x in register.pins:
         depth = min(HOLE * register.pin, (1.0 - FLOOR) * register.thickness)
-        _descend(out, np.array([x, 0.0, register.thickness - depth]), register.thickness, m.plunge)
+        descend(out, np.array([x, 0.0, register.thickness - depth]), register.thickness, m.plunge)
         out.rapid(z=safe)
     out.say("M5", "M0 (change the tool)")
 
 
-def _begin(out: _Writer, tool: str, radius: float, spindle: float, safe: float) -> None:
-    name = {"ball": "ball nose", "flat": "flat end"}.get(tool, tool)
-    out.say(f"(tool: {name}, radius {radius:.17g} mm)", f"M3 S{spindle:g}")
-    out.rapid(z=safe)
-    out.feed = 0.0
-
-
-def _descend(out: _Writer, to: np.ndarray, top: float, plunge: float) -> None:
-    """Approach a point: rapid above it, rapid down to the stock, plunge."""
-    out.rapid(x=float(to[0]), y=float(to[1]))
-    if to[2] < top < out.at[2]:
-        out.rapid(z=top)
-    out.cut(to[None], plunge)
-
-
 def _finish(
-    out: _Writer, m: Milling, field: HeightField, heights: Tensor, passes: Iterator[np.ndarray], top: float, tolerance: float
+    out: Writer, m: Milling, field: HeightField, heights: Tensor, passes: Iterator[np.ndarray], top: float, tolerance: float
 ) -> None:
     """Write the finishing passes, from the top of the stock on."""
     offset, first = BallOffset(field, heights, m.tool_radius), True
@@ -249,13 +174,13 @@ def _finish(
     for line in batches(passes, move):
         points = with_heights(line, offset, move, tolerance)
         if first:
-            _descend(out, points[0], top, m.plunge)
+            descend(out, points[0], top, m.plunge)
             first = False
         out.cut(points, m.feed)
 
 
 def _rough(
-    out: _Writer, m: Milling, field: HeightField, heights: Tensor, aperture: Aperture, top: float, low: float, safe: float
+    out: Writer, m: Milling, field: HeightField, heights: Tensor, aperture: Aperture, top: float, low: float, safe: float
 ) -> None:
     """Write layers from the top of the stock down to the allowance above the surface."""
     make, radius = {"ball": BallOffset, "flat": FlatOffset}[m.roughing_tool], m.rough_radius
@@ -276,6 +201,6 @@ def _rough(
             for run in np.split(np.arange(len(points)), np.flatnonzero(np.diff(kept.astype(int))) + 1):
                 if kept[run[0]]:
                     run = points[max(0, run[0] - 1) : run[-1] + 2]  # including a point above on either side
-                    _descend(out, np.array([*run[0, :2], max(run[0, 2], floor)]), top, m.plunge)
+                    descend(out, np.array([*run[0, :2], max(run[0, 2], floor)]), top, m.plunge)
                     out.cut(run, m.feed)
                     out.rapid(z=safe)
