@@ -611,7 +611,7 @@ def refuse_others(asked: Given, taken: Sequence[str]) -> None:
     others = [table.TABLE[path].option for path in getattr(asked, "given", {}) if not path.startswith("design.")]
     names = [option.name for option in others if option is not None]
     for name, value in vars(asked).items():
-        if name not in {*common, *taken, "given", "project", "say"} and value not in (getattr(type(asked), name, None), {}):
+        if name not in {*common, *taken, "given", "project", "say", "held"} and value not in (getattr(type(asked), name, None), {}):
             names.append(f"--{name.replace('_', '-')}")
     if names:
         raise InputError(f"{names[0]} is for a lens before its light, and not available for a lamp around it (--lamp)")

@@ -17,7 +17,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-FLAME = Path(__file__).resolve().parents[2] / "examples" / "flame.png"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+FLAME = EXAMPLES / "flame.png"
 LENS = ("--mag", "3", "--linear")
 #: Options of each kind.
 KINDS = {
@@ -30,13 +31,28 @@ KINDS = {
     "disc of 2 mm at 1 m": (*LENS, "--waves", "off", "--source", "disc", "--source-size", "2", "--source-position", "0,0,-1000"),
     "colours": ("--mag", "3", "--waves", "off", "--color"),
     "two free-form sides": ("--linear", "--waves", "off", "--collimate", "--throw", "60", "--mag", "1.4"),
+    "two pictures": (
+        *("--linear", "--waves", "off", "--second", f"{EXAMPLES / 'ball.png'}", "--second-at", "600", "--second-size", "60"),
+        *("--throw", "100", "--lens-size", "20", "--mag", "1.5"),
+    ),
     "three free-form surfaces": (
         *(*LENS, "--waves", "off", "--element", "lens z=60 thickness=6 radius=120,-120 index=1.5 free=both"),
     ),
     "lens behind a fixed one": (*LENS, "--waves", "off", "--element", "lens z=-20 thickness=4 radius=150,inf glass=N-BK7"),
     "index that varies": (*LENS, "--waves", "off", "--gradient", "radial", "--gradient-terms=-1e-3"),
     "designed index": (*LENS, "--gradient", "free"),
+    "designed index and surface": (*LENS, "--gradient", "free", "--with-surface"),
+    "relief on a tube": (
+        *("--linear", "--waves", "off", "--lens-size", "20", "--mag", "1.5", "--throw", "200", "--glass", "acrylic"),
+        *("--base-radius=-60,inf", "--entrance", "parallel"),
+    ),
     "4 x 4 lenslets": (*LENS, "--waves", "off", "--array", "4x4"),
+    "4 x 4 lenslets, hexagonal": (*LENS, "--waves", "off", "--array", "4x4", "--packing", "hexagonal"),
+    "4 x 4 lenslets with an LED each": (
+        *("--linear", "--array", "4x4", "--lens-size", "24", "--thickness", "3", "--throw", "200", "--picture-size", "90"),
+        *("--source", "disc", "--source-size", "0.4", "--source-position", "0,0,-10", "--intensity", "lambertian"),
+        *("--cone", "30", "--source-each"),
+    ),
     "network over a range": (*LENS, "--network", "dense", "--over", "throw=250:350", "--control", "67"),
     "laser beam": (
         *("--source", "gaussian", "--waist", "3", "--wavelengths", "1064", "--lens-size", "12", "--throw", "500", "--margin", "0"),
