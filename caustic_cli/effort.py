@@ -93,6 +93,9 @@ class Effort:
     borders: int
     #: As `creased` for two free-form sides, on nets that have no ripples as wide as pixels, and with subpixels that show them.
     sides: Refinement
+    #: The same for two pictures, which the initial surfaces pair to first order in the angles only: many iterations on a net and
+    #: with rays for which they are cheap.
+    pairs: Refinement
     #: (wavelengths of white light, iterations) of each stage on the wave image: the first ones need few.
     waves: tuple[tuple[int, int], ...]
     #: Time for them with `waves = "auto"`, s on two cores.
@@ -162,6 +165,7 @@ DRAFT = Effort(
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
     borders=12,
     sides=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
+    pairs=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 75),), large=LargePictures(256, 384)),
     waves=((3, 6), (5, 6)),
     wave_seconds=8.0,
 )
@@ -175,6 +179,7 @@ STANDARD = Effort(
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     borders=30,
     sides=Refinement(3.0, 765, 64, 4_000_000, 8, ((1.0, 20),)),
+    pairs=Refinement(1.5, 765, 32, 4_000_000, 4, ((0.5, 60), (1.0, 90))),
     waves=((5, 20), (6, 20)),
     wave_seconds=25.0,
 )
@@ -185,6 +190,7 @@ FINE = Effort(
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     borders=60,
     sides=Refinement(4.0, 1021, 64, 4_000_000, 8, ((1.0, 60),)),
+    pairs=Refinement(2.0, 1021, 64, 4_000_000, 6, ((0.25, 100), (1.0, 60))),
     waves=((5, 12), (6, 12), (8, 40)),
     wave_seconds=90.0,
 )

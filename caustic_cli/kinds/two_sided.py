@@ -12,6 +12,7 @@ from torch import Tensor
 from caustic_cli.config.default_stages import refinement
 from caustic_cli.config.settings import Settings
 from caustic_cli.config.wave_stages import wave_stages
+from caustic_cli.effort import Refinement
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import InitialSurface
@@ -43,8 +44,6 @@ if TYPE_CHECKING:
 by_waves = OnDemand("caustic_cli.studies.waves")
 
 THICK, SAG = 2.0, 0.45  # thickness over width of the lens, and largest height of a side over thickness
-#: Factor of the iterations for two pictures, which the initial surfaces pair to first order in the angles only.
-LONGER = 2.5
 #: Figures of the initial surfaces that are kept.
 STARTED = ("relative_rms", "wave_relative_rms", "second_relative_rms", "angle_rms_mrad")
 #: Divisor of the rays for the initial surfaces.
@@ -87,9 +86,7 @@ class TwoSides(SeveralSurfaces):
         cls.complete_control(d)
         d.fill_design(preconditioner="laplacian")
         if not d.complete_given_stages():
-            longer = 1.0 if d.s.chosen("second.file") is None else LONGER
-            stages = refinement(d.lens.control, d.rays, d.resolution, d.effort.sides)
-            stages = [stage | {"iterations": round(longer * stage["iterations"])} for stage in stages]
+            stages = refinement(d.lens.control, d.rays, d.resolution, cls.effort_of(d))
             d.set_stages(stages + (wave_stages(d.s, d.source, d.effort, d.lit) if asked == "on" else []))
             return
         refuse_contradiction(asked, d)
@@ -98,7 +95,12 @@ class TwoSides(SeveralSurfaces):
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:
-        return [d.effort.sides.spans(max(d.resolution)) + p for p in d.lens.degree]
+        return [cls.effort_of(d).spans(max(d.resolution)) + p for p in d.lens.degree]
+
+    @classmethod
+    def effort_of(cls, d: Defaults) -> Refinement:
+        """The numbers of its stages."""
+        return d.effort.sides if d.s.chosen("second.file") is None else d.effort.pairs
 
     @property
     def half_sizes(self) -> list[tuple[float, float]]:
