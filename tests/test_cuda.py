@@ -6,6 +6,7 @@ import importlib
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +23,7 @@ from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves import propagation
-from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene import FreeForm, Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.workflow.compilation import choose_device
 
 HERE = Path(__file__).parent
@@ -52,6 +53,19 @@ def test_cuda_equals_cpu(sampler, dtype, close):
         gradients.append(Objective(scene, field, rays, target, "rms-light", LossImage(filter), dtype=dtype)(heights).gradient.cpu())
     for cpu, cuda in (images, gradients):
         assert float((cpu - cuda).norm() / cpu.norm()) < close
+
+
+@needs_device
+def test_rays_on_a_curved_entrance_are_those_of_the_cpu():
+    scene, field, heights = lens()
+    x, y = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in (8, 9))
+    entrance = FreeForm((0.2 * x[:, None] ** 2 - 0.1 * y[None, :] ** 2).numpy(), (3, 3))
+    scene = replace(scene, lens=replace(scene.lens, entrance=entrance))
+    cpu, cuda = (
+        expose(scene, field, heights, Sampler("lines", (200, 150), seed=3, device=device), Filter("cosine", (3, 3))).image.cpu()
+        for device in ("cpu", "cuda")
+    )
+    assert float((cpu - cuda).norm() / cpu.norm()) < 1e-9
 
 
 @pytest.mark.parametrize("asked", ["auto", "cpu", "cuda"])

@@ -529,8 +529,8 @@ def test_effects_know_of_all_glasses_and_apertures():
 def test_a_study_of_effects_leaves_out_what_other_elements_exclude():
     scene = replace(SCENE, elements=(thick(60.0, 26.0, (150.0, -150.0), 6.0, 1.5),))
     plan = compile_plan(scene, FIELD, wavy())
-    asked = {one.name: one for one in plan.effects if one.name in ("gradient-index", "mirror", "absorption", "fresnel")}
-    rows = {name: _row(one, plan, scene, FIELD, wavy(), 500, 1, 0, torch.float64) for name, one in asked.items()}
+    asked = {one.name: k for k, one in enumerate(plan.effects) if one.name in ("gradient-index", "mirror", "absorption", "fresnel")}
+    rows = {name: _row(plan, scene, FIELD, wavy(), 500, [1, 1], 0, torch.float64, k) for name, k in asked.items()}
     assert rows.pop("gradient-index") is None and rows.pop("mirror") is None
     assert len(rows) == 2 and all(row is not None for row in rows.values())
     assert STUDIES["effects"].capability.supports(scene)

@@ -273,7 +273,7 @@ def test_a_render_under_another_light(lens, capfd):
 
 def test_the_door_is_light():
     """The package itself loads nothing: --help has to answer at once."""
-    assert set(caustic_cli.__all__) == {"Lens", "Render", "__version__", "design", "load", "render", "trace"}
+    assert set(caustic_cli.__all__) == {"Lens", "Render", "__version__", "design", "load", "render", "spread", "trace"}
     with pytest.raises(AttributeError, match="no attribute 'lens'"):
         _ = caustic_cli.lens
     assert (Path(caustic_cli.__file__).parent / "py.typed").exists()

@@ -313,7 +313,7 @@ def test_a_robust_loss_of_both_sides_has_their_gradients(_here, capfd):
     assert isinstance(problem, RobustTwoSides)
     start = load("p")
     both = torch.stack([torch.from_numpy(start.scene.lens.entrance.heights.copy()), start.heights])
-    loss = problem.objective(0, both)
+    loss = problem.objective(len(problem.stages) - 1, both)
     assert len(loss.members) == 5
     draws = [m.objective.scene for m in loss.members[1:]]
     for a, b in (draws[:2], draws[2:]):  # antithetic

@@ -85,7 +85,7 @@ def _moved_before_surface(tracer, o, d, state: RayState, element, heights) -> tu
     if back < 0.0:
         return o, state
     way = -(back * (1.0 + 1e-9) + BEFORE) / d[2]
-    moved = (torch.as_tensor(c + way * v, dtype=torch.float64) for c, v in zip(o, d, strict=True))
+    moved = (torch.as_tensor(c + way * v, dtype=torch.float64, device=state.power.device) for c, v in zip(o, d, strict=True))
     path = state.path + tracer.media[0].index_at(state.wavelength) * way
     return tuple(c.expand(state.power.shape) for c in moved), replace(state, path=path)
 

@@ -86,7 +86,7 @@ class Benchmark:
         seed: of the rays of the first round; each round takes the next one.
         repeats: rounds.
         max_rays: rays of the largest setting.
-        progress: called with (rays traced, rays in total) after every round, or None.
+        progress: called with (rays traced, rays in total) after every image of this process, or None.
     """
 
     scene: Scene
@@ -162,21 +162,25 @@ class Benchmark:
 
     def _mapped(self, function: Callable[[int], R], seeds: Sequence[int], rays: int) -> list[R]:
         """`ranks.mapped` over seeds, for each of which so many rays are traced."""
-        before = self.done
+        whole = self.done + len(seeds) * rays
+        found = ranks.mapped(function, seeds)
+        self.tick(whole - self.done)  # what other processes traced
+        return found
 
-        def told(done: int) -> None:
-            self.done = before + done * rays
-            if self.progress is not None:
-                self.progress(self.done, self.total)
-
-        return ranks.mapped(function, seeds, told)
+    def tick(self, rays: int) -> None:
+        """Tell that so many rays were traced."""
+        self.done += rays
+        if self.progress is not None and rays:
+            self.progress(self.done, self.total)
 
     def __getstate__(self) -> dict:
         return vars(self) | {"progress": None}  # for other processes, which tell nothing
 
 
 def _image(bench: Benchmark, setting: Setting, seed: int) -> Tensor:
-    return bench.image(setting, seed)
+    image = bench.image(setting, seed)
+    bench.tick(setting.rays)
+    return image
 
 
 def _round(
@@ -190,6 +194,7 @@ def _round(
             start = time.perf_counter()
             image = bench.image(setting, seed)
             found.append((image, time.perf_counter() - start))
+            bench.tick(setting.rays)
     return found
 
 
