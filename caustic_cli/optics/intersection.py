@@ -17,6 +17,7 @@ it; no iteration is differentiated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from importlib import import_module
@@ -59,7 +60,7 @@ class Method:
         if self.name == "newton":
             return None, None
         mesh = import_module("caustic_cli.optics.mesh").TriangleMesh(field, heights, *self.parts)  # its search is compiled
-        rays = torch.broadcast_tensors(*(torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)))
+        rays = _broadcast(*origin, *direction)
         start, missed, _ = mesh.intersect(*rays, self.recursive)
         if self.name == "mesh":
             t = torch.where(missed == 0, start, torch.zeros_like(start))
@@ -119,6 +120,12 @@ def within(status: Tensor, t: Tensor, origin, direction, radius: float | None) -
     return torch.where(beyond & (status == Status.HIT), int(Status.MISSED), status)
 
 
+def _broadcast(*components: Tensor | float) -> Sequence[Tensor]:
+    """Components of rays, which may be numbers, as float64 tensors of one shape on one device."""
+    device = next((c.device for c in components if isinstance(c, Tensor)), None)
+    return torch.broadcast_tensors(*(torch.as_tensor(c, dtype=torch.float64, device=device) for c in components))
+
+
 def _above_aperture(origin, direction, half_size: tuple[float, float]) -> tuple[Tensor, Tensor]:
     """The interval of t in which rays are above an aperture, from 0 on; empty as (inf, ...)."""
     enter, leave = torch.zeros_like(direction[0]), torch.full_like(direction[0], torch.inf)
@@ -136,8 +143,7 @@ def reference(
 ) -> tuple[Tensor, Tensor]:
     """Distances t (N,) mm to the first intersections, and `Status` (N,), by safeguarded Newton iteration in plain torch."""
     h, middle = surface.centred(None if heights is None else heights.detach())
-    tensors = [torch.as_tensor(c, dtype=torch.float64).detach() for c in (*origin, *direction)]
-    ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*tensors)
+    ox, oy, oz, dx, dy, dz = (c.detach() for c in _broadcast(*origin, *direction))
     oz, dz = side * (oz - middle), side * dz
     low_z, high_z = sorted(side * z for z in surface.hull(h))
     rx, ry = surface.half_size
