@@ -141,6 +141,8 @@ def main() -> None:
         _ignore_signals()
     except KeyboardInterrupt:  # a second signal, during the report of an error or signal
         status = _interrupted()
+    if (ranks := sys.modules.get("caustic_cli.optics.ranks")) is not None:
+        ranks.leave(status)
     sys.exit(status)
 
 

@@ -98,3 +98,4 @@ def counted() -> list[int]:
 
 if __name__ == "__main__":
     main(Path(sys.argv[1]))
+    ranks.leave(0)

@@ -17,13 +17,16 @@ def follow(device: str) -> None:
     """All processes but the first: serve it; it handles the signals and says what is wrong.
 
     Raises:
-        SystemExit: it has stopped, or interrupts them.
+        SystemExit: its work is done, or it has stopped, or interrupts them.
     """
+    status = 0
     try:
         with ranks.process_group(device), signals_collected():
             ranks.serve()
-    except (ranks.RankStopped, KeyboardInterrupt) as stop:
-        raise SystemExit(1) from stop
+    except (ranks.RankStopped, KeyboardInterrupt):
+        status = 1
+    ranks.leave(status)
+    raise SystemExit(status)  # of a group that was never met
 
 
 def spread(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
@@ -40,6 +43,5 @@ def spread(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """
     if checks.rank_and_size()[0] > 0:
         follow("cpu")
-        raise SystemExit(0)
     with ranks.process_group("cpu"):
         return ranks.mapped(function, items)
