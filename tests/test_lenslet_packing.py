@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 import caustic_cli as caustic
 from caustic_cli import cli
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.lenslets import Section, array_objective, initial_array, lenslets, sampled
+from caustic_cli.inverse.lenslets import SplineSection, array_objective, initial_array, lenslets, sampled
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.bspline import SplineSpace
@@ -113,7 +113,7 @@ def test_light_between_round_lenslets_is_absorbed(packing, fill):
 def test_a_section_is_the_same_spline(degree, low, high):
     whole = SplineSpace.uniform(8 + degree, degree)
     net = torch.from_numpy(np.random.default_rng(2).normal(size=whole.n))
-    section = Section.of(whole, low, high)
+    section = SplineSection.of(whole, low, high)
     own = net[section.where] if section.matrix is None else section.matrix @ net[section.where]
     at = np.linspace(0.0, 1.0, 33)
     expected = BSpline(whole.knots.numpy(), net.numpy(), degree)(low + (high - low) * np.clip(at, 1e-12, 1 - 1e-12))

@@ -58,7 +58,7 @@ BESIDE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class PlacedPicture:
     """A picture on a screen: irradiance (k, l), half sizes and centre of it in the screen's own coordinates, mm."""
 
     light: np.ndarray
@@ -67,7 +67,7 @@ class Picture:
     centre: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def on(cls, screen: Screen, light: np.ndarray) -> Picture:
+    def on(cls, screen: Screen, light: np.ndarray) -> PlacedPicture:
         """One that fills its screen."""
         return cls(light, screen, screen.half_size)
 
@@ -146,9 +146,9 @@ def first_sides(
         most, max(least, A_PIXEL * max(target.shape), *(n - p for n, p in zip(field.shape, scene.lens.degree, strict=True)))
     )
     levels = [_level(scene, field, cells, COARSER)] * (REPEATS - 1) + [_level(scene, field, cells, 1)]
-    near = Picture.on(scene.screen, target)
+    near = PlacedPicture.on(scene.screen, target)
     if second is not None and behind.screen is not None:
-        slopes = slopes_behind(near, Picture.on(behind.screen, second))
+        slopes = slopes_behind(near, PlacedPicture.on(behind.screen, second))
     else:
         slopes = slopes_towards(near, behind.focus)
     points, lit = near.points, near.lit
@@ -189,7 +189,7 @@ def _level(scene: Scene, field: HeightField, cells: int, coarser: int) -> _Level
     return _Level(_CellGrid.of(lens.half_size, -(-cells // coarser)), field)
 
 
-def slopes_behind(near: Picture, far: Picture) -> np.ndarray:
+def slopes_behind(near: PlacedPicture, far: PlacedPicture) -> np.ndarray:
     """Slopes (dx/dz, dy/dz) of the rays from the pixel corners of the near picture to the far one, (2, k + 1, l + 1), by optimal
     transport."""
     small = [_resampled(p) for p in (near, far)]
@@ -205,7 +205,7 @@ def slopes_behind(near: Picture, far: Picture) -> np.ndarray:
     return _slopes(np.stack(points_in_space(far.screen, *found)) - near.points)
 
 
-def slopes_towards(near: Picture, focus: tuple[float, float, float] | None) -> np.ndarray:
+def slopes_towards(near: PlacedPicture, focus: tuple[float, float, float] | None) -> np.ndarray:
     """The same for light that leaves the picture along the normal of its screen, or towards a focus behind it, mm."""
     points = near.points
     if focus is None:
@@ -294,7 +294,7 @@ def _on_exit(light: np.ndarray, ex: np.ndarray, ey: np.ndarray, grid: _CellGrid)
     return gaussian_filter(total, SMOOTH)
 
 
-def _resampled(picture: Picture) -> Picture:
+def _resampled(picture: PlacedPicture) -> PlacedPicture:
     """The picture resampled to about PAIRED cells along each axis: pixels subdivided or binned, zero-padded at the high edges."""
     light = picture.light
     cut = [min(CUT, max(1, round(PAIRED / n))) for n in light.shape]
@@ -305,4 +305,4 @@ def _resampled(picture: Picture) -> Picture:
     light = light.reshape(light.shape[0] // by[0], by[0], light.shape[1] // by[1], by[1]).sum((1, 3))
     half = picture.half[0] * grown[0], picture.half[1] * grown[1]
     x, y = (c + g - h for c, g, h in zip(picture.centre, half, picture.half, strict=True))
-    return Picture(light, picture.screen, half, (x, y))
+    return PlacedPicture(light, picture.screen, half, (x, y))

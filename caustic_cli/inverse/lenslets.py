@@ -41,7 +41,7 @@ from caustic_cli.optics.resampling import area_average, resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Aperture, Lens, Scene, Source
-from caustic_cli.scene.packing import ConvexAperture, Disc
+from caustic_cli.scene.packing import ConvexAperture, DiscAperture
 from caustic_cli.scene.traits import Capability
 
 LENSLETS = Capability(
@@ -58,7 +58,7 @@ CELLS, SLACK = 16, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Section:
+class SplineSection:
     """A spline space on a part of the domain of another, from knot to knot: its control points are `matrix` times those of the
     other in `where`, or these points themselves where both of its ends are knots of full multiplicity (None)."""
 
@@ -67,7 +67,7 @@ class Section:
     matrix: Tensor | None
 
     @classmethod
-    def of(cls, whole: SplineSpace, low: float, high: float) -> Section:
+    def of(cls, whole: SplineSpace, low: float, high: float) -> SplineSection:
         """The part from one knot to another."""
         p, t = whole.degree, whole.knots
         inner = t[(t > low + KNOT_RESOLUTION) & (t < high - KNOT_RESOLUTION)]
@@ -97,7 +97,7 @@ class Lenslet:
 
     scene: Scene
     field: HeightField
-    sections: tuple[Section, Section]
+    sections: tuple[SplineSection, SplineSection]
     share: float
     middle: tuple[float, float] = (0.0, 0.0)
 
@@ -146,7 +146,7 @@ def _outline(lens: Lens, k: int, half: tuple[float, float], middle: tuple[float,
     """What is clear of lenslet k in its own frame; None for its whole rectangle."""
     x, y = lens.cells.centres[k]
     if lens.round_lenslets:
-        return Disc(half, (x - middle[0], y - middle[1]), lens.cells.radius)
+        return DiscAperture(half, (x - middle[0], y - middle[1]), lens.cells.radius)
     if lens.pieces == lens.array:
         return None
     return ConvexAperture(half, tuple((a - middle[0], b - middle[1]) for a, b in lens.cells.outline(k)))
@@ -161,13 +161,13 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
     lens, screen = scene.lens, scene.screen
     LENSLETS.refuse(scene)
     spaces = HeightField.of(replace(lens, control=control or lens.control)).spaces
-    found, known = [], dict[tuple[int, float, float], Section]()
+    found, known = [], dict[tuple[int, float, float], SplineSection]()
     for k in range(math.prod(lens.array)):
         i, j = divmod(k, lens.array[1])
         ends = _rectangle(lens, spaces, k)
         for axis, (low, high) in enumerate(ends):
             if (axis, low, high) not in known:
-                known[axis, low, high] = Section.of(spaces[axis], low, high)
+                known[axis, low, high] = SplineSection.of(spaces[axis], low, high)
         one, two = (known[axis, low, high] for axis, (low, high) in enumerate(ends))
         (w, mx), (h, my) = (((b - a) * 2.0 * r, (a + b - 1.0) * r) for (a, b), r in zip(ends, lens.half_size, strict=True))
         own = replace(

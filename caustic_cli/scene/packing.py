@@ -89,7 +89,7 @@ class ConvexAperture(PartAperture):
 
 
 @dataclass(frozen=True)
-class Disc(PartAperture):
+class DiscAperture(PartAperture):
     """A circle anywhere within a rectangle.
 
     Args:
