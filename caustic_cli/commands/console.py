@@ -39,6 +39,8 @@ LINE_EVERY = 0.5
 OF_LENS = ("relative_rms", "noise", "on_screen", "of_source", "middle_relative_rms")
 #: Terminal width from which on a progress bar and the time elapsed are shown, and least width of the values of a table there.
 WIDE, NARROW = 90, 24
+#: Error by rays over that by waves from which on it needs a word.
+WORSE = 1.1
 
 
 class _TimeLeft(ProgressColumn):
@@ -424,8 +426,10 @@ def _noise_of_image(figures: dict) -> list[tuple[str, str]]:
 
 
 def _rays_alone(figures: dict) -> str:
-    """Figures of the ray image of a lens that waves judge, and why they are no fault of it."""
+    """Figures of the ray image of a lens that waves judge, and why they are no fault of it where they are worse."""
+    worse = (figures.get("relative_rms") or 0.0) > WORSE * figures["error"]
+    why = "; no fault of the lens, which was refined for the diffraction that rays leave out" if worse else ""
     return (
         f"relative RMS error {_number(figures, 'relative_rms', '.4f')}{_noise(figures, 'noise')}, light on the picture"
-        f" {_number(figures, 'on_target', '.2%')}; no fault of the lens, which was refined for the diffraction that rays leave out"
+        f" {_number(figures, 'on_target', '.2%')}{why}"
     )
