@@ -29,15 +29,14 @@ from caustic_cli.export.milling.paths import batches, raster, spacing, spiral, w
 from caustic_cli.export.milling.rotary import write_rotary
 from caustic_cli.export.milling.turning import write_turning
 from caustic_cli.export.milling.writer import (
-    COUNTED,
     FIRST_MOVE,
-    LEAST_DIGITS,
-    MORE_DIGITS,
     MOST_OVER,
     PATH_PART,
     Writer,
     begin,
     descend,
+    digits_of,
+    figures_of,
 )
 from caustic_cli.export.part import Part, Register
 from caustic_cli.export.text import CREATED
@@ -84,16 +83,14 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     step = spacing(m.path, outline, step)
     scallop = m.scallop_of(step, concave, slope)
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
-    digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance / unit)) + MORE_DIGITS)
+    digits = digits_of(tolerance / unit)
     top = m.top(high)
     _refuse_deep(part, low, m.tool_radius - math.sqrt(m.tool_radius**2 - min(2.0 * over * over, 0.99 * m.tool_radius**2)))
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
     passes = spiral(outline, step) if m.path == "spiral" else raster(outline, step, lines[m.path])
     with atomic_file(path) as file:
         out = Writer(file, digits, unit, simple)
-        out.say(*_head(part, m, step, scallop, top, digits, tolerance))
-        place = file.tell()
-        out.say(" " * COUNTED, f"{'G21' if unit == 1.0 else 'G20'} G90 G17 G94")
+        out.start(*_head(part, m, step, scallop, top, digits, tolerance))
         if part.register is not None and part.register.drills(part.turned):
             _drill(out, m, part.register, safe)
         if m.roughing is not None:
@@ -102,21 +99,8 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
             out.say("M5", "M0 (change the tool)")
         begin(out, "ball", m.tool_radius, m.spindle, safe)
         _finish(out, m, field, heights, passes, top, tolerance)
-        out.rapid(z=safe)
-        out.say("M5", "M30")
-        file.seek(place)
-        file.write(f"({out.lines} lines, {out.length:.0f} mm of cut, about {out.minutes:.1f} minutes)".ljust(COUNTED).encode())
-    return {
-        "lines": out.lines,
-        "minutes": out.minutes,
-        "length_mm": out.length,
-        "tool_radius_mm": m.tool_radius,
-        "step_over_mm": step,
-        "scallop_mm": scallop,
-        "scallop_slope": 0.5 * step / m.tool_radius,
-        "tolerance_mm": tolerance,
-        "stock_mm": top,
-    }
+        out.end(safe)
+    return figures_of(out, out.minutes, m.tool_radius, step, scallop, tolerance, top)
 
 
 def _refuse_deep(part: Part, low: float, deeper: float) -> None:

@@ -30,15 +30,14 @@ from caustic_cli.export.milling import Milling
 from caustic_cli.export.milling.offset import BallOffset, shape_of
 from caustic_cli.export.milling.paths import batches, raster, spacing, with_heights
 from caustic_cli.export.milling.writer import (
-    COUNTED,
     FIRST_MOVE,
-    LEAST_DIGITS,
-    MORE_DIGITS,
     MOST_OVER,
     PATH_PART,
     Writer,
     begin,
     descend,
+    digits_of,
+    figures_of,
 )
 from caustic_cli.export.part import Part
 from caustic_cli.export.text import CREATED
@@ -141,13 +140,10 @@ def write_rotary(path: str | Path, part: Part, m: Milling, tolerance: float | No
     step = spacing("raster", outline, step)
     scallop = m.scallop_of(step * wider, concave, slope)
     tolerance = PATH_PART * scallop if tolerance is None else tolerance
-    digits = max(LEAST_DIGITS, math.ceil(-math.log10(tolerance / unit)) + MORE_DIGITS)
     top = m.top(high)
     with atomic_file(path) as file:
-        out = Writer(file, digits, unit, simple, letters="XAZ")
-        out.say(*_head(part, cylinder, m, step, scallop, top, tolerance))
-        place = file.tell()
-        out.say(" " * COUNTED, f"{'G21' if unit == 1.0 else 'G20'} G90 G17 G94")
+        out = Writer(file, digits_of(tolerance / unit), unit, simple, letters="XAZ")
+        out.start(*_head(part, cylinder, m, step, scallop, top, tolerance))
         begin(out, "ball", m.tool_radius, m.spindle, top + m.safe_height)
         offset, first = RadialOffset(cylinder, part.field, part.heights, m.tool_radius), True
         spans = (2.0 * r / (len(s.breaks) - 1) for s, r in zip(part.field.spaces, part.field.half_size, strict=True))
@@ -158,22 +154,9 @@ def write_rotary(path: str | Path, part: Part, m: Milling, tolerance: float | No
                 descend(out, points[0], top, m.plunge)
             first = False
             out.cut(points, m.feed)
-        out.rapid(z=top + m.safe_height)
-        out.say("M5", "M30")
-        file.seek(place)
-        file.write(f"({out.lines} lines, {out.length:.0f} mm of cut, about {out.minutes:.1f} minutes)".ljust(COUNTED).encode())
-    return {
-        "lines": out.lines,
-        "minutes": out.minutes,
-        "length_mm": out.length,
-        "tool_radius_mm": m.tool_radius,
-        "step_over_mm": step,
-        "scallop_mm": scallop,
-        "scallop_slope": 0.5 * step / m.tool_radius,
-        "tolerance_mm": tolerance,
-        "stock_mm": top,
-        "turned_deg": math.degrees(outline.half_size[1] / cylinder.radius),
-    }
+        out.end(top + m.safe_height)
+    turned = math.degrees(outline.half_size[1] / cylinder.radius)
+    return figures_of(out, out.minutes, m.tool_radius, step, scallop, tolerance, top) | {"turned_deg": turned}
 
 
 def _head(part: Part, cylinder: _Cylinder, m: Milling, step: float, scallop: float, top: float, tolerance: float) -> list[str]:

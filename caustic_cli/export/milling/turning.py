@@ -37,6 +37,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.milling.offset import shape_of
 from caustic_cli.export.milling.paths import batches, with_heights
+from caustic_cli.export.milling.writer import figures_of
 from caustic_cli.export.part import Part
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
@@ -202,16 +203,8 @@ def write_turning(path: str | Path, part: Part, m: Milling, tolerance: float | N
         for line in batches(spiral(turns, feed), move):
             out.cut(with_heights(line, offset, move, tolerance, PROBES))
         out.end()
-    return {
-        "lines": out.lines,
-        "minutes": (turns + 1) / m.revolutions,
-        "length_mm": out.length,
-        "tool_radius_mm": m.tool_radius,
-        "step_over_mm": feed,
-        "scallop_mm": scallop,
-        "scallop_slope": 0.5 * feed / m.tool_radius,
-        "tolerance_mm": tolerance,
-        "stock_mm": top,
+    minutes = (turns + 1) / m.revolutions
+    return figures_of(out, minutes, m.tool_radius, feed, scallop, tolerance, top) | {
         "turns": turns + 1,
         "blank_mm": 2.0 * outer,
         "clearance_needed_deg": moved["needed"],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from dataclasses import field as made
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ class Writer:
     letters: of the coordinates.
     """
 
-    file: object
+    file: Any
     digits: int
     unit: float = 1.0
     simple: bool = False
@@ -39,6 +40,7 @@ class Writer:
     feed: float = 0.0
     forms: list[str] = made(default_factory=list)
     letters: str = "XYZ"
+    place: int = 0
 
     def __post_init__(self):
         words = [f"{letter}%.{self.digits}f" for letter in self.letters]
@@ -47,6 +49,20 @@ class Writer:
     def say(self, *lines: str) -> None:
         self.file.write("".join(f"{line}\n" for line in lines).encode("ascii"))
         self.lines += len(lines)
+
+    def start(self, *head: str) -> None:
+        """The comments at the head, room for `end`, and the modes."""
+        self.say(*head)
+        self.place = self.file.tell()
+        self.say(" " * COUNTED, f"{'G21' if self.unit == 1.0 else 'G20'} G90 G17 G94")
+
+    def end(self, safe: float) -> None:
+        """Up to a height, the end of the program, and at its head what it takes."""
+        self.rapid(z=safe)
+        self.say("M5", "M30")
+        self.file.seek(self.place)
+        words = f"({self.lines} lines, {self.length:.0f} mm of cut, about {self.minutes:.1f} minutes)"
+        self.file.write(words.ljust(COUNTED).encode())
 
     def rapid(self, x: float | None = None, y: float | None = None, z: float | None = None) -> None:
         """Rapid move (G0) in x and y, or in z."""
@@ -82,6 +98,26 @@ class Writer:
         long = float(np.linalg.norm(points - before, axis=1).sum()) * self.unit
         self.lines, self.length, self.minutes = self.lines + len(rows), self.length + long, self.minutes + long / feed
         self.at = tuple((points[-1] * self.unit).tolist())
+
+
+def digits_of(tolerance: float) -> int:
+    """Digits of coordinates for moves within a tolerance, both in the unit of the program."""
+    return max(LEAST_DIGITS, math.ceil(-math.log10(tolerance)) + MORE_DIGITS)
+
+
+def figures_of(out: Any, minutes: float, radius: float, step: float, scallop: float, tolerance: float, stock: float) -> dict:
+    """Figures of a finished program, as of `gcode.write_gcode`; out: its writer; lengths in mm."""
+    return {
+        "lines": out.lines,
+        "minutes": minutes,
+        "length_mm": out.length,
+        "tool_radius_mm": radius,
+        "step_over_mm": step,
+        "scallop_mm": scallop,
+        "scallop_slope": 0.5 * step / radius,
+        "tolerance_mm": tolerance,
+        "stock_mm": stock,
+    }
 
 
 def begin(out: Writer, tool: str, radius: float, spindle: float, safe: float) -> None:
