@@ -48,10 +48,6 @@ KINDS = {
     ),
     "4 x 4 lenslets": (*LENS, "--waves", "off", "--array", "4x4"),
     "4 x 4 hexagonal lenslets": (*LENS, "--waves", "off", "--array", "4x4", "--packing", "hexagonal"),
-    "4 x 4 lenslets with a point each": (
-        *("--linear", "--waves", "off", "--array", "4x4", "--lens-size", "24", "--thickness", "3", "--throw", "200"),
-        *("--picture-size", "90", "--source", "point", "--source-position", "0,0,-10", "--cone", "30", "--source-each"),
-    ),
     "network over a range": (*LENS, "--network", "dense", "--over", "throw=250:350", "--control", "67"),
     "laser beam": (
         *("--source", "gaussian", "--waist", "3", "--wavelengths", "1064", "--lens-size", "12", "--throw", "500", "--margin", "0"),
