@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 import caustic_cli
+from caustic_cli.cli import leave
 from caustic_cli.inverse import lamp, objective
 from caustic_cli.optics import lamp as optics
 from caustic_cli.optics import ranks
@@ -98,4 +99,4 @@ def counted() -> list[int]:
 
 if __name__ == "__main__":
     main(Path(sys.argv[1]))
-    ranks.leave(0)
+    leave(0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import gc
 import inspect
 import math
 import os
@@ -658,6 +659,8 @@ def start_torch(device: str, threads: int | None, say: ConsoleReporter):
         raise InputError("--device cuda: no CUDA device is available; use auto or cpu")
     from caustic_cli.workflow.compilation import choose_device  # noqa: PLC0415
 
+    gc.freeze()  # the libraries' objects are not searched for unused ones again
+    gc.enable()
     return choose_device(device, say)
 
 

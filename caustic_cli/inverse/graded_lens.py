@@ -43,6 +43,7 @@ from caustic_cli.inverse.objective import Evaluation
 from caustic_cli.inverse.parametrisation import FreeHeights
 from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics.gradient.fields import SplineIndex
+from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Scene
@@ -132,8 +133,8 @@ class JointLoss:
                 raise
             return math.inf, torch.zeros_like(x)  # treated as too long by the line search
         relative, self.is_lit = found.loss * self.pixels, True
-        (by_surface,) = torch.autograd.grad(heights, self.surface.y, found.gradients[EXIT])
-        by_index = torch.stack(torch.autograd.grad(values, [net.y for net in self.layers], found.gradients[name]))
+        (by_surface,) = pull_back([heights], [self.surface.y], [found.gradients[EXIT]])
+        by_index = torch.stack(pull_back([values], [net.y for net in self.layers], [found.gradients[name]]))
         blocks = [weight * by.reshape(-1) for weight, by in zip(self.weights, (by_surface, by_index), strict=True)]
         value = 0.5 * relative * relative
         self.evaluations[value] = found

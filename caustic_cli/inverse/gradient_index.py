@@ -40,6 +40,7 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.gradient.fields import SplineIndex
 from caustic_cli.optics.gradient.medium import GradientMedium, index_name
+from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces import HeightField, Plane
 from caustic_cli.optics.system import ENTRANCE, EXIT, Element, System
@@ -192,7 +193,7 @@ class _LossOfLayers:
                 raise
             return math.inf, torch.zeros_like(x)  # treated as too long by the line search
         self.evaluations[result.loss], self.is_lit = result, True
-        by = torch.autograd.grad(values, [net.y for net in self.nets], result.gradients[name])
+        by = pull_back([values], [net.y for net in self.nets], [result.gradients[name]])
         return result.loss, torch.stack(by).reshape(-1)
 
 

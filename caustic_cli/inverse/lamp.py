@@ -36,6 +36,7 @@ from caustic_cli.optics import ranks
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.lamp import ChipRays, PointGrid, chip_grids, from_centre, land, least_wall, through, through_point
 from caustic_cli.optics.lamp_side import Roof, inner_side
+from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene import Screen
@@ -149,11 +150,11 @@ class _Traced(torch.autograd.Function):
         def pull(traced: tuple[tuple[Tensor, tuple[Tensor, ...]], Sequence[Tensor]]) -> Tensor:
             (leaf, found), by = traced
             pairs = [(c, g) for c, g in zip(found, (*by, *by_sums), strict=True) if c.requires_grad]
-            return torch.autograd.grad([c for c, _ in pairs], leaf, [g for _, g in pairs])[0]
+            return pull_back([c for c, _ in pairs], [leaf], [g for _, g in pairs])[0]
 
         parts = []
         for done, landed, image in ctx.groups:
-            by = torch.autograd.grad(image, [c for three in landed for c in three], by_image)
+            by = pull_back([image], [c for three in landed for c in three], [by_image])
             parts += list(zip(done, (by[k : k + 3] for k in range(0, len(by), 3)), strict=True))
         pulled = ctx.of.pool.map(pull, parts)
         own = (None if some is None else [sum(islice(pulled, len(some)))] for some in ctx.of.groups)

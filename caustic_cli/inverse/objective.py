@@ -29,6 +29,7 @@ from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.optics import ranks
 from caustic_cli.optics.emission import Emission, Rays
 from caustic_cli.optics.memory import smaller_chunk
+from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
@@ -315,7 +316,7 @@ class Objective:
         if not pulls:
             return [None] * len(leaves)
         values, pulled = zip(*pulls, strict=True)
-        return torch.autograd.grad(values, leaves, pulled, allow_unused=True)
+        return pull_back(values, leaves, pulled)
 
     def _of_point(self, values: Sequence[Tensor], k: int) -> list[Tensor]:
         """Of accumulated values, or their derivatives, which may be None, those of source point k."""

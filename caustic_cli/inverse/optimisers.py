@@ -16,6 +16,7 @@ from caustic_cli.inverse.lbfgs import LBFGS, UNFIT
 from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Evaluation, Objective
 from caustic_cli.inverse.parametrisation import Heights
+from caustic_cli.optics.pullback import pull_back
 
 #: Most halvings of a rejected step of Adam.
 MOST_HALVINGS = 200
@@ -44,9 +45,10 @@ class Adam:
 
     def step(self) -> bool:
         z, e = self.here or self._evaluate_here()
-        before = [p.detach().clone() for p in self.heights.parameters()]
-        self.adam.zero_grad()
-        z.backward(e.gradient.to(z.device))
+        parameters = list(self.heights.parameters())
+        before = [p.detach().clone() for p in parameters]
+        for p, by in zip(parameters, pull_back([z], parameters, [e.gradient.to(z.device)]), strict=True):
+            p.grad = by
         self.adam.step()
         self.loss, self.on_screen, self.image, self.here = e.loss, e.on_screen, e.image, None
         for halvings in range(MOST_HALVINGS):
@@ -55,7 +57,7 @@ class Adam:
                 return True
             except (NoLight, NotFinite):
                 self.rejected += halvings == 0
-                for p, old in zip(self.heights.parameters(), before, strict=True):
+                for p, old in zip(parameters, before, strict=True):
                     p.data = 0.5 * (p.data + old)
         raise CausticError("no step along the gradient leads to a finite loss with light on the screen; a smaller ⟨lr⟩ may help")
 
@@ -132,7 +134,7 @@ class QuasiNewton:
             self.rejected += 1
             return math.inf, torch.zeros_like(x)  # treated as too long by the line search
         relative = e.loss * self.pixels
-        (g,) = torch.autograd.grad(z, self.parameter, e.gradient.to(z.device) * (self.pixels * relative))
+        (g,) = pull_back([z], [self.parameter], [e.gradient.to(z.device) * (self.pixels * relative)])
         value = 0.5 * relative * relative
         least = min(self.seen, default=value)  # the line search accepts the best or the last evaluation
         self.seen = {key: found for key, found in self.seen.items() if key == least} | {value: (e.on_screen, e.image)}

@@ -19,6 +19,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 
 from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 #: Regularisation parameter: weight of second differences relative to slopes of points of mean weight.
@@ -47,7 +48,7 @@ def fitted(
         net = net.detach().clone().requires_grad_()
         _, gx, gy = backend.spline_at(field, net, *points)
         ways = [weight * (g.detach() if along is None else a) for g, a in zip((gx, gy), along or (gx, gy), strict=True)]
-        return torch.autograd.grad((gx, gy), net, ways)[0]
+        return pull_back((gx, gy), [net], ways)[0]
 
     def bent(net: Tensor) -> Tensor:
         """S^T S c."""

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -54,8 +53,6 @@ class _Process:
     store: Any = None
     #: Of lists of items.
     numbers: Iterator[int] = field(default_factory=count)
-    #: Whether it has met others.
-    met: bool = False
 
 
 _here = _Process()
@@ -92,7 +89,7 @@ def process_group(device: str) -> Iterator[int]:
                 f"{place}: is in use; the environment's MASTER_PORT must be a free port for the ranks to meet"
             ) from error
         raise CausticError(f"{place}: the ranks did not meet there ({str(error).splitlines()[0][:200]})") from error
-    rank, _here.met = dist.get_rank(), True
+    rank = dist.get_rank()
     try:
         with _within("alone" if rank else "leading"):
             yield rank
@@ -102,18 +99,6 @@ def process_group(device: str) -> Iterator[int]:
                 _send(None)
             dist.destroy_process_group()
             _here.store = None
-
-
-def leave(status: int) -> None:
-    """End this process at once if it was one of several, its files being written.
-
-    In two of eight runs with many designs one of three processes aborted in a library after Python's end, upon which torchrun stops
-    the others and reports a failure.
-    """
-    if _here.met:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
 
 
 def _meet(device: str) -> None:

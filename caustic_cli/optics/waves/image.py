@@ -23,6 +23,7 @@ from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.emission.coherent import Mode, central_mode, modes, outermost_modes, spots
 from caustic_cli.optics.image import with_colour
 from caustic_cli.optics.interaction import Parameters
+from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.spread import POINT, Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
@@ -460,7 +461,7 @@ class Imager:
             return by_image
         with torch.enable_grad():
             image = torch.zeros(resolution, dtype=by_image.dtype, device=by_image.device, requires_grad=True)
-            return torch.autograd.grad(self.spread_out(image, mode), image, by_image)[0]
+            return pull_back([self.spread_out(image, mode)], [image], [by_image])[0]
 
     def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Phase, rad, including that of the Fresnel kernel, and amplitude of each sample of a wavefront, (n, m)."""

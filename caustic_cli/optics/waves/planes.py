@@ -19,6 +19,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.waves.propagation import phase_of
 from caustic_cli.optics.waves.sampling import Sampling
@@ -126,7 +127,7 @@ class PlanesExposure:
             self.image(change, keep=True)
         assert self.kept is not None
         (leaf, found), self.kept = self.kept, None
-        out += torch.autograd.grad(found, leaf, by_pixel)[0]
+        out += pull_back([found], [leaf], [by_pixel])[0]
 
 
 def _through(s, path, amplitude, foot, maps, point, normal, here, length, behind, dtype, pixel) -> Tensor:

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.waves.sampling import Sampling
 
 TURN = 2.0 * math.pi
@@ -122,7 +123,7 @@ class Exposure:
         with torch.enable_grad():
             leaf = change.detach().requires_grad_()
             found = self.image(leaf)
-        out += torch.autograd.grad(found, leaf, by_pixel.to(found.dtype))[0]
+        out += pull_back([found], [leaf], [by_pixel.to(found.dtype)])[0]
 
 
 @torch.no_grad()

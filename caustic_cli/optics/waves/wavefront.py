@@ -40,6 +40,7 @@ from caustic_cli.loading import OnDemand
 from caustic_cli.optics.effects import Requests
 from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.interaction import Interaction, Parameters
+from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.receiver import NormalPlane, dot
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
@@ -367,7 +368,7 @@ class PathChange:
         """The derivative by the heights, float64, from that by the change of the paths (n, m)."""
         with torch.enable_grad():
             heights = torch.zeros([s.n for s in self.surface.spaces], dtype=torch.float64, device=by.device, requires_grad=True)
-            return torch.autograd.grad(self.of(heights), heights, by)[0]
+            return pull_back([self.of(heights)], [heights], [by])[0]
 
 
 @dataclass
