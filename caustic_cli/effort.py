@@ -166,7 +166,7 @@ DRAFT = Effort(
     borders=12,
     sides=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
     pairs=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 75),), large=LargePictures(256, 384)),
-    waves=((3, 6), (5, 6)),
+    waves=((4, 12),),
     wave_seconds=8.0,
 )
 STANDARD = Effort(
