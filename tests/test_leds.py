@@ -220,7 +220,7 @@ def test_an_archive_has_them(leds, monkeypatch, capfd):
         (f"{EACH} --mirror", "--source-each is for lenses"),
         (f"{EACH} --array 1", "--source-each needs --array"),
         (f"{EACH} --array 9", "--source-each is for arrays of up to 64 lenslets, got 81"),
-        (f"{EACH} --waves on", "needs one source"),
+        (f"{EACH} --waves on", "--waves on is not for --source-each"),
     ],
 )
 def test_refusals(options, words, leds, monkeypatch, capfd):

@@ -187,8 +187,9 @@ def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     assert other["lost"]["missed_lens"] == 0.0  # another light is another light for all of it
     assert cli.run(["gradmap", "blob.caustic", "--control", "5,5", "--rays", "20000", "--check", "--quiet", "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["maps"][0]["check"]["relative_error"] < 1e-4
-    Path("two.toml").write_text("[[source]]\n[[source]]\ntype = 'point'\n")
-    assert "--waves on needs one source" in run(*base, "-o", "c.caustic", "--waves", "on", code=2)
+    Path("led.dat").write_bytes(zemax(*cone_of(20_000, 12.0)))
+    Path("two.toml").write_text("[[source]]\n[[source]]\ntype = 'rays'\nfile = 'led.dat'\n")
+    assert "--waves on: a ray file contains no phase" in run(*base, "-o", "c.caustic", "--waves", "on", code=2)
 
 
 @pytest.mark.parametrize("spectra", [(NONE,) * 5, tuple(((450.0 + 20.0 * k, 650.0), (1.0, 0.5 + k)) for k in range(5))])

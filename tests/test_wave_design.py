@@ -51,8 +51,10 @@ from caustic_cli.scene import (
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.light import WAVE_NODES
 from caustic_cli.scene.screen import Sags
+from caustic_cli.scene.sources.several import Several
 from caustic_cli.studies import diffraction
 from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.studies.waves import unseen_figures
 from caustic_cli.workflow import comparison
 
 SMALL = ["--lens-size", "2", "--throw", "60", "--mag", "2", "--resolution", "32", "--quiet", "--threads", "1"]
@@ -103,6 +105,7 @@ SCENES = {
     "plane": scene_of(),
     "point": scene_of(Points(((0.1, 0.0, -80.0),))),
     "disc": scene_of(Disc(angle=0.1)),
+    "two sources": scene_of(Several(members=(PlaneWave(), Points(((0.1, 0.0, -80.0),))))),
     "gradient index": scene_of(gradient=Gradient("radial", (-2e-2, 1e-2))),
     "curved screen": replace(scene_of(), screen=Screen((5.0, 5.0), 60.0, (32, 32), radius=(12.0, 12.0))),
 }
@@ -174,6 +177,26 @@ def test_wavelengths_of_the_scene_are_those_of_the_loss():
     assert made.parts[0].line.system is not made.parts[1].line.system
     image = wave_image(scene, field, heights, finer=1.5, dtype=torch.float64).image
     assert made(heights).loss == pytest.approx(relative_rms(image, goal()) / 1024, rel=5e-3)
+
+
+def test_the_light_of_several_sources_is_the_sum_of_each():
+    """Each at its own spectral lines and power; two sources as one of their powers; and at wavelengths beside their lines."""
+    near = Points(((0.1, 0.0, -80.0),), powers=(3.0,))
+    spectra = (((450.0,), (1.0,)), ((600.0, 650.0), (1.0, 3.0)))
+    both = Light(None, (450.0, 600.0, 650.0), (0.25, 0.1875, 0.5625))
+    scene = replace(scene_of(Several(members=(PlaneWave(), near), spectra=spectra)), light=both)
+    heights, field, target = heights_of(scene), HeightField.of(scene.lens), goal()
+    made = WaveObjective(scene, field, heights, target, "rms", wavelengths=(500.0,), dtype=torch.float64)
+    alone = [replace(scene, source=one, light=Light(None, *of)) for one, of in zip((PlaneWave(), near), spectra, strict=True)]
+    images = [wave_image(one, field, heights, finer=1.5, dtype=torch.float64).image for one in alone]
+    whole = 0.25 * images[0] + 0.75 * images[1]
+    assert made(heights).loss == pytest.approx(relative_rms(whole, target) / target.numel(), rel=5e-3)
+    found = unseen_figures(scene, field, heights, target.numpy())
+    assert found["wave_unseen_wavelengths"] == pytest.approx([445.5, 454.5, 594.0, 606.0, 643.5, 656.5])
+    assert found["wave_unseen_relative_rms"] == pytest.approx(relative_rms(whole, target), rel=0.05)
+    twice = replace(scene, source=Several(members=(near, near), spectra=(spectra[1],) * 2))
+    one, two = (WaveObjective(k, field, heights, target, "rms", dtype=torch.float64)(heights) for k in (alone[1], twice))
+    assert two.loss == pytest.approx(one.loss, rel=1e-9) and torch.allclose(two.gradient, one.gradient, rtol=1e-7)
 
 
 # what is decided

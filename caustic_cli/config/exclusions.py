@@ -75,7 +75,10 @@ EXCLUDED: dict[str, dict[str, str]] = {
         ),
         "design.waves on": "⟨design.waves⟩ on refines heights, but ⟨lens.gradient⟩ free designs the index, by rays",
     },
-    "source.each": {"source.also": "⟨source.each⟩ needs one [[source]], of which there is one behind every lenslet"},
+    "source.each": {
+        "source.also": "⟨source.each⟩ needs one [[source]], of which there is one behind every lenslet",
+        "design.waves on": "{said} is not for ⟨source.each⟩: the light of every source has an image behind the whole array",
+    },
     "source.tilt": {
         **dict.fromkeys(
             ("lens.gradient free", "element", "design.over"),

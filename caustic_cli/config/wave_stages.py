@@ -9,8 +9,10 @@ from caustic_cli.config.design import region_of
 from caustic_cli.config.exclusions import refuse_excluded, why_excluded
 from caustic_cli.config.settings import Settings, build_lens, build_light, build_screen, build_source
 from caustic_cli.effort import Effort
+from caustic_cli.errors import InputError
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.waves.sampling import A_PIXEL, FINER
+from caustic_cli.optics.waves.unsupported import WAVE_REFINEMENT
 from caustic_cli.scene import Scene, Source
 
 
@@ -23,24 +25,30 @@ def without_waves(s: Settings, given: bool) -> str:
         return ""
     if given:
         return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
-    if (seen := _resolution(s, build_source(s.source))).source > seen.pixel:
+    if (seen := Resolution.before(_scene(s, build_source(s.source)), s.target.size)).source > seen.pixel:
         return "that of a source whose blur is wider than a pixel takes many times as long; ⟨waves⟩ on refines it all the same"
     excluded = why_excluded("design.waves auto", s)
     return excluded or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; ⟨waves⟩ on takes it"
 
 
 def wave_stages(s: Settings, source: Source, effort: Effort, lit: tuple[float, float]) -> list[Table]:
-    """Stages that refine the wave image after the ray image, on request or where diffraction matters."""
+    """Stages that refine the wave image after the ray image, on request or where diffraction matters.
+
+    Raises:
+        InputError: they are asked for, and the scene has none.
+    """
     lens, screen, asked = s.lens, s.screen, s.design.waves
     if asked == "on":
         refuse_excluded("design.waves on", s)
     elif asked == "off" or why_excluded("design.waves auto", s):
         return []
-    seen = _resolution(s, source)
+    scene = _scene(s, source)
+    if asked == "on" and (why := WAVE_REFINEMENT.why_not(scene)):
+        raise InputError(why)
+    seen, light = Resolution.before(scene, s.target.size), scene.light
     if asked == "auto" and (seen.source > seen.pixel or not seen.matters):
         return []
-    light = build_light(s)
-    own, whole = tuple(map(float, s.source.get("wavelengths", ()))), light.continuum
+    own, whole = light.wavelengths if s.source.get("wavelengths") else (), light.continuum
     plan = wave_refinement(wave_samples(s, seen, lit), len(own), effort, timed=asked == "auto")
     if region_of(s.design) is not None:
         plan = [(count, LONGER_BEAMS * n) for count, n in plan]
@@ -48,10 +56,9 @@ def wave_stages(s: Settings, source: Source, effort: Effort, lit: tuple[float, f
     return [on_waves(lens.control, own if own or whole is None else whole.rule(count)[0], apron, n) for count, n in plan]
 
 
-def _resolution(s: Settings, source: Source) -> Resolution:
-    """The resolution limit of complete settings."""
-    scene = Scene(source, build_lens(s.lens), build_screen(s.screen), build_light(s))
-    return Resolution.before(scene, s.target.size)
+def _scene(s: Settings, source: Source) -> Scene:
+    """Source, lens, screen and light of complete settings."""
+    return Scene(source, build_lens(s.lens), build_screen(s.screen), build_light(s))
 
 
 def wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:

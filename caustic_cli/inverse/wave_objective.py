@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import torch
@@ -29,7 +30,7 @@ from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.image import with_colour
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
-from caustic_cli.optics.waves.image import Imager, Line, lines_of
+from caustic_cli.optics.waves.image import Imager, Line, by_source, lines_of
 from caustic_cli.optics.waves.propagation import TURN, PrunedExposure, pruning_pays
 from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.optics.waves.wavefront import Wavefront
@@ -47,6 +48,8 @@ class Contribution:
     h_0, and its total power."""
 
     line: Line
+    #: Of the light of its source.
+    imager: Imager
     mode: int
     #: Number of the wavefront, which parts with the same rays share.
     front: int
@@ -96,23 +99,25 @@ class WaveObjective:
         self.share = ranks.rank_and_size()
         parameters = {EXIT: self.middle}
         with torch.no_grad():
-            receiver = receiver_of(lines[0].system, screen)
-            finer = 1.0 if self.loss.box is None else FINER
-            self.imager = Imager.of(lines, parameters, receiver, finer, watched=_lit(scene, target), dense=True)
+            finer, lit = 1.0 if self.loss.box is None else FINER, _lit(scene, target)
+            sources = [
+                (Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, watched=lit, dense=True), light)
+                for light in by_source(lines)
+            ]
             #: The wavefronts with the changes of their optical paths by the heights, by number; those of other ranks are missing.
             self.fronts: dict[int, tuple[Wavefront, Any]] = {}
-            self.parts = list(self._parts(lines, parameters))
+            self.parts = list(self._parts(sources, parameters))
             self.numbers = sorted({part.front for part in self.parts})
         self.in_colour = lines[0].colour is not None
         self.colours = len({line.channel for line in lines if line.channel is not None})
-        self.keeps = sum(self._is_own(part.front) for part in self.parts) * 8 * self.imager.sampling.samples <= KEPT
+        self.keeps = sum(8 * part.imager.sampling.samples for part in self.parts if self._is_own(part.front)) <= KEPT
 
-    def _parts(self, lines: list[Line], parameters) -> Iterator[Contribution]:
+    def _parts(self, sources: list[tuple[Imager, list[Line]]], parameters) -> Iterator[Contribution]:
         """All contributions, without an exposure those of other ranks."""
-        imager, numbers, backend = self.imager, dict[tuple, int](), backend_for(self.middle.device)
-        one_index = len({(id(line.system), line.label) for line in lines}) == 1  # for `image_at`, which rank 0 asks for
-        for line in lines:
-            for k, mode in enumerate(imager.modes(line.system)):
+        numbers, backend = dict[tuple, int](), backend_for(self.middle.device)
+        for imager, lines in sources:
+            one_index = len({(id(line.system), line.label) for line in lines}) == 1  # for `image_at`, which rank 0 asks for
+            for line, (k, mode) in product(lines, enumerate(imager.modes(lines[0].system))):
                 # wavelengths of the same index have the same rays
                 number = numbers.setdefault((id(line.system), line.label, k), len(numbers))
                 own = self._is_own(number)
@@ -121,17 +126,17 @@ class WaveObjective:
                     self.fronts[number] = front, backend.path_change(self.field, front.last, self.dtype)
                 if own:
                     front = self.fronts[number][0]
-                    yield Contribution(line, k, number, self._exposure(line, front), front.power)
+                    yield Contribution(line, imager, k, number, self._exposure(imager, line, front), front.power)
                 else:
-                    yield Contribution(line, k, number)
+                    yield Contribution(line, imager, k, number)
 
     def _is_own(self, front: int) -> bool:
         """Whether a wavefront is this rank's."""
         return front % self.share[1] == self.share[0]
 
-    def _exposure(self, line: Line, front: Wavefront) -> Any:
+    def _exposure(self, imager: Imager, line: Line, front: Wavefront) -> Any:
         """The image of a contribution; only that part of it which the loss looks at, where this is faster."""
-        imager, box = self.imager, self.loss.box
+        box = self.loss.box
         if box is not None and imager.receiver.across and not imager.spreading:
             shape, edges = imager.sampling.padded, imager.edges(line)
             if pruning_pays(shape, imager.sampling.count, edges, box, True):
@@ -170,7 +175,7 @@ class WaveObjective:
         by_changes = {number: torch.zeros_like(change) for number, change in changes.items()}
         for part in self.parts:
             if part.exposure is not None:
-                pull = self.imager.gathered(part.line.part * self._channel(by_image, part), part.mode, part.exposure.resolution)
+                pull = part.imager.gathered(part.line.part * self._channel(by_image, part), part.mode, part.exposure.resolution)
                 part.exposure.pull(pull, changes[part.front], by_changes[part.front])
         gradient = torch.zeros_like(heights)
         pulled = ([self.fronts[k][1].pull(by_changes[k])] if k in by_changes else None for k in self.numbers)
@@ -188,22 +193,27 @@ class WaveObjective:
         """Power of a part on the pixels, and in all; None of another rank's."""
         if part.exposure is None:
             return None
-        found = self.imager.spread_out(part.exposure.image(changes[part.front], self.keeps), part.mode)
+        found = part.imager.spread_out(part.exposure.image(changes[part.front], self.keeps), part.mode)
         return [part.line.part * found.double(), torch.tensor(part.line.part * part.power, dtype=torch.float64)]
 
     @torch.no_grad()
     def image_at(self, heights: Tensor, wavelengths: tuple[float, ...]) -> Tensor | None:
         """The image (n_x, n_y) at other wavelengths, nm, by the same wavefronts; None where these differ by wavelength."""
-        lines, a = lines_of(self.scene, self.field, wavelengths), self.apron
-        modes = self.imager.modes(lines[0].system)
-        if self.colours or len(modes) != len(self.fronts) or len({(id(line.system), line.label) for line in lines}) > 1:
+        lights, a = by_source(lines_of(self.scene, self.field, wavelengths)), self.apron
+        fronts = {(id(part.imager), part.mode): part.front for part in self.parts}
+        one_index = all(len({(id(line.system), line.label) for line in light}) == 1 for light in lights)
+        if self.colours or len(fronts) != len(self.numbers) or not one_index:
             return None
         image = torch.zeros(self.loss.target.shape, dtype=torch.float64, device=self.middle.device)
-        for k, (front, change) in self.fronts.items():
-            changed = change.of(heights.detach().to(self.middle) - self.middle)
-            for line in lines:
-                found = self._exposure(line, front).image(changed)
-                image += line.part * self.imager.spread_out(found, k).double()
+        moved = heights.detach().to(self.middle) - self.middle
+        imagers = {id(part.imager): part.imager for part in self.parts}.values()
+        for imager, light in zip(imagers, lights, strict=True):
+            for k in range(len(imager.modes(light[0].system))):
+                front, change = self.fronts[fronts[id(imager), k]]
+                changed = change.of(moved)
+                for line in light:
+                    found = self._exposure(imager, line, front).image(changed)
+                    image += line.part * imager.spread_out(found, k).double()
         return image[a : image.shape[0] - a, a : image.shape[1] - a]
 
     def _channel(self, values: Tensor, part: Contribution) -> Tensor:

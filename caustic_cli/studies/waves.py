@@ -93,19 +93,23 @@ def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np
     Returns:
         wave_unseen_relative_rms and wave_unseen_wavelengths, nm, those that the glass is known at.
     """
-    light = scene.light
-    if light.continuum is not None or scene.colored:
+    if scene.light.continuum is not None or scene.colored:
         return {}
     low, high = material(scene.lens.glass).range_nm if scene.lens.glass is not None else (0.0, math.inf)
-    beside = [
-        (a * w, part) for w, part in zip(light.wavelengths, light.fractions, strict=True) for a in ASIDE if low <= a * w <= high
-    ]
-    if not beside:
-        return {}
-    wavelengths, weights = zip(*sorted(beside), strict=True)
-    scene = replace(scene, light=replace(light, wavelengths=wavelengths, weights=weights))
-    found = wave_image(scene, field, heights.detach(), finer=FINER)
-    return {"wave_unseen_relative_rms": _judged(found, target)["relative_rms"], "wave_unseen_wavelengths": list(wavelengths)}
+    images, found = [], set[float]()
+    for one, fraction in zip(scene.by_source, scene.source.fractions, strict=True):
+        lines = zip(one.light.wavelengths, one.light.fractions, strict=True)
+        beside = [(a * w, part) for w, part in lines for a in ASIDE if low <= a * w <= high]
+        if not beside:
+            return {}
+        wavelengths, weights = zip(*sorted(beside), strict=True)
+        one = replace(one, light=replace(one.light, wavelengths=wavelengths, weights=weights))
+        images.append((fraction, wave_image(one, field, heights.detach(), finer=FINER)))
+        found |= set(wavelengths)
+    image = sum(fraction * seen.image for fraction, seen in images)
+    leaving = math.fsum(fraction * seen.leaving for fraction, seen in images)
+    judged = figures_of_merit(Image(image, leaving, {}), target)
+    return {"wave_unseen_relative_rms": judged["relative_rms"], "wave_unseen_wavelengths": sorted(found)}
 
 
 def independent_wavelengths(light: Light, used: Collection[float]) -> tuple[float, ...]:
@@ -126,14 +130,16 @@ def fast_error(
     used: Collection[float],
     image_at: Callable[[Tensor, tuple[float, ...]], Tensor | None] = lambda *_: None,
 ) -> float | None:
-    """Relative RMS error of the wave image at `independent_wavelengths`, or of a coloured one at its own.
+    """Relative RMS error of the wave image at `independent_wavelengths`, or of a coloured one, and of several sources with spectral
+    lines, at their own.
 
     image_at: image at heights and wavelengths by an approximation, None where it does not hold, such as that of a `WaveObjective`.
 
     Returns:
         the error, None if there is no wave image.
     """
-    wavelengths = () if scene.light.color else independent_wavelengths(scene.light, used)
+    own = scene.light.color or (len(scene.source.members) > 1 and scene.light.continuum is None)
+    wavelengths = () if own else independent_wavelengths(scene.light, used)
     try:
         image = image_at(heights, wavelengths) if wavelengths else None
         if image is None:

@@ -122,7 +122,7 @@ class WaveImage:
 
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
     """Spectral lines of a scene, by wavelength and polarisation: its own, those that represent its continuous spectrum, or those
-    at the given wavelengths, see `Light.lines`.
+    at the given wavelengths, see `Light.lines`; of several sources only those with a continuous spectrum take the given ones.
 
     Raises:
         NoWaveImage: the scene has none.
@@ -133,7 +133,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
         return [
             replace(line, part=fraction * line.part)
             for one, fraction in zip(scene.by_source, scene.source.fractions, strict=True)
-            for line in lines_of(one, field, wavelengths)
+            for line in lines_of(one, field, wavelengths if one.light.continuum is not None else None)
         ]
     found, systems = [], {}
     continuous = scene.light.continuum is not None
@@ -211,12 +211,9 @@ def image_of(
 ) -> WaveImage:
     """The wave image of spectral lines on one screen, source by source; see `wave_image`."""
     exact, found = any(h.requires_grad for h in parameters.values()), []
-    by_source: dict[int, list[Line]] = {}
-    for line in lines:
-        by_source.setdefault(id(line.system.source), []).append(line)
     device = next((heights.device for heights in parameters.values()), "cpu")
     with backend_for(device).keeping_surfaces():
-        for light in by_source.values():
+        for light in by_source(lines):
             imager = Imager.of(
                 light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=perturbation is not None
             )
@@ -266,6 +263,14 @@ def _summed(pairs: list[tuple[Tensor, Tensor] | None]) -> tuple[Tensor, Tensor] 
     if len(known) < len(pairs):
         return None
     return cast(Tensor, sum(a for a, _ in known)), cast(Tensor, sum(b for _, b in known))
+
+
+def by_source(lines: list[Line]) -> list[list[Line]]:
+    """Lines grouped by the source of their light."""
+    groups: dict[int, list[Line]] = {}
+    for line in lines:
+        groups.setdefault(id(line.system.source), []).append(line)
+    return list(groups.values())
 
 
 def _alike(lines: list[Line]) -> list[list[Line]]:

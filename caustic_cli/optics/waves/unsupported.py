@@ -21,23 +21,25 @@ MASKED = "light is diffracted by the edge of every round lenslet, and a field is
 WAVE_IMAGE = Capability(
     "wave image",
     {
-        "ray file": "a ray file contains no phase",
+        **dict.fromkeys(("ray file", "ray file among sources"), "a ray file contains no phase"),
         "round lenslets": MASKED,
     },
 )
 WAVE_REFINEMENT = Capability(
     "design by waves",
     {
-        "ray file": "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
+        **dict.fromkeys(
+            ("ray file", "ray file among sources"),
+            "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
+        ),
         "round lenslets": f"⟨design.waves⟩ on: {MASKED}",
-        "several sources": "⟨design.waves⟩ on needs one source: light of several is refined by rays alone",
     },
 )
 WAVES_BY_DEFAULT = Capability(
     "design by waves unless asked for",
     {
         **WAVE_IMAGE.unsupported,
-        "several sources": "light of several sources is refined by rays alone",
+        "several sources": "it takes a wave image of each of several sources; ⟨waves⟩ on refines them all the same",
         "two sides": "behind the creases of a free-form entrance rays cross inside the glass, and light without a single wavefront"
         " has none; ⟨waves⟩ on refines the exit where there are no creases",
         "other elements": "behind other elements it takes many samples, or a part of the light; ⟨waves⟩ on refines it all the same",
