@@ -6,7 +6,6 @@ The parser and its dependencies are imported by `run`, after `main` has installe
 
 from __future__ import annotations
 
-import atexit
 import errno
 import gc
 import io
@@ -15,7 +14,9 @@ import signal
 import sys
 import threading
 import warnings
-from typing import Any, NoReturn
+from typing import Any
+
+from caustic_cli.loading import leave
 
 
 class SignalReceived(KeyboardInterrupt):
@@ -145,15 +146,6 @@ def main() -> None:
     except KeyboardInterrupt:  # a second signal, during the report of an error or signal
         status = _interrupted()
     leave(status)
-
-
-def leave(status: int) -> NoReturn:
-    """End this process after its exit functions, without taking down the libraries, which costs a design 1 s, and in which one of
-    three processes of torchrun aborted in two of eight runs with many designs."""
-    atexit._run_exitfuncs()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
 
 
 def _install_signal_handlers() -> None:

@@ -1,11 +1,15 @@
-"""Modules of capabilities that few commands need, loaded when they are first used rather than by every import."""
+"""Modules of capabilities that few commands need, loaded when they are first used rather than by every import; and the end of a
+process, which does not take them down."""
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import os
+import sys
 import threading
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 
 class OnDemand:
@@ -25,3 +29,12 @@ class OnDemand:
 def load_behind(module: OnDemand) -> None:
     """Load a module that is going to be used, in another thread."""
     threading.Thread(target=module._load, name="loading").start()
+
+
+def leave(status: int) -> NoReturn:
+    """End this process after its exit functions, without taking down the libraries, which costs a design 1 s, and in which one of
+    three processes of torchrun aborted in two of eight runs with many designs."""
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)

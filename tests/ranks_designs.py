@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 
 import caustic_cli
-from caustic_cli.cli import leave
 from caustic_cli.inverse import lamp, objective
+from caustic_cli.loading import leave
 from caustic_cli.optics import lamp as optics
 from caustic_cli.optics import ranks
 from caustic_cli.workflow import convergence

@@ -27,4 +27,6 @@ def pull_back(outputs: Sequence[Tensor], inputs: Sequence[Tensor], by: Sequence[
 
     As `torch.autograd.grad` with `grad_outputs`, for which torch 2.11 first loads SymPy: 0.4 s of a design.
     """
-    return torch.autograd.grad(_Contracted.apply(list(by), *outputs), list(inputs), allow_unused=True)
+    with torch.enable_grad():  # also within the derivative of another function
+        whole = _Contracted.apply(list(by), *outputs)
+    return torch.autograd.grad(whole, list(inputs), allow_unused=True)

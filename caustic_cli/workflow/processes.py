@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
+from caustic_cli.loading import leave
 from caustic_cli.optics import ranks
 from caustic_cli.schema import checks
 from caustic_cli.workflow.progress import signals_collected
@@ -13,20 +14,16 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def follow(device: str) -> None:
-    """All processes but the first: serve it; it handles the signals and says what is wrong.
-
-    Raises:
-        SystemExit: its work is done, or it has stopped, or interrupts them.
-    """
+def follow(device: str) -> NoReturn:
+    """All processes but the first: serve it, which handles the signals and says what is wrong, and end when its work is done, or it
+    has stopped, or interrupts them."""
     status = 0
     try:
         with ranks.process_group(device), signals_collected():
             ranks.serve()
     except (ranks.RankStopped, KeyboardInterrupt):
         status = 1
-    ranks.leave(status)
-    raise SystemExit(status)  # of a group that was never met
+    leave(status)
 
 
 def spread(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
