@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.optimize import nnls
 
 from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
 from caustic_cli.config import settings
 from caustic_cli.errors import at_most
 from caustic_cli.inverse import source_limits
-from caustic_cli.inverse.deconvolution import _cells, deconvolved, error_bound
+from caustic_cli.inverse.deconvolution import Blur, _cells, deconvolved, error_bound
 from caustic_cli.inverse.objective import Objective, SourceBlur
 from caustic_cli.inverse.schedule import LossImage, Stage
 from caustic_cli.inverse.source_limits import etendue_limit, performance_limits, point_source, regular_rays, source_spread
@@ -353,11 +354,36 @@ def test_no_lens_is_better_than_the_bound(kind, tilt):
 def test_several_blurs_allow_for_more_than_one():
     """The error of the best sum of two is bounded from below by no more than either's, and reached by none alone."""
     target, one, two = disc_on(24), spread(0.3), spread(0.4)
-    alone, both = (error_bound(target, blurs, 400) for blurs in ([one], [one, two]))
+    alone, both = (error_bound(target, [Blur((blur,)) for blur in blurs], 400) for blurs in ([one], [one, two]))
     assert 0.5 * alone < both <= alone * 1.001
-    assert error_bound(target, [one], 400) == pytest.approx(deconvolved(target, one, 400).bound)
+    assert error_bound(target, [Blur((one,))], 400) == pytest.approx(deconvolved(target, one, 400).bound)
     mixed = 0.5 * (one(_cells(torch.from_numpy(target), one)) + two(_cells(torch.from_numpy(target), two)))
-    assert error_bound(mixed.numpy(), [one, two], 400) < 0.02  # such a picture has no least error
+    assert error_bound(mixed.numpy(), [Blur((one,)), Blur((two,))], 400) < 0.02  # such a picture has no least error
+
+
+@pytest.mark.parametrize("divided", [False, True])
+def test_the_bound_is_that_of_the_least_squares_over_all_light(divided):
+    """Against non-negative least squares over the pixels' light, of which the left half has one blur and the right half another, or
+    all has both; what reaches only dark pixels may have any."""
+    n, blurs = 14, [spread(0.15), spread(0.23)]
+    target = disc_on(n)
+    left = torch.zeros(n, n, dtype=torch.bool)
+    left[: n // 2] = True
+    parts = [left, ~left] if divided else [torch.ones_like(left)] * 2
+    columns = []
+    for blur, part in zip(blurs, parts, strict=True):
+        a, b = blur.beside
+        for i, j in torch.nn.functional.pad(part.double()[None, None], (b, b, a, a), mode="replicate")[0, 0].nonzero().tolist():
+            light = torch.zeros(n + 2 * a, n + 2 * b, dtype=torch.float64)
+            light[i, j] = 1.0
+            columns.append(blur(light).flatten().numpy())
+    b, matrix = (target / target.mean()).ravel(), np.stack(columns, 1)
+    matrix = matrix[:, matrix.sum(0) > 1e-9].round(12)  # without light that reaches nothing but by rounding
+    heavy = 1e3  # of the mean, which is to be 1
+    seen = matrix @ nnls(np.vstack([matrix, heavy * matrix.mean(0)]), np.append(b, heavy))[0]
+    least = math.sqrt(np.mean((seen / seen.mean() - b) ** 2))
+    found = error_bound(target, [Blur((blur,), part) for blur, part in zip(blurs, parts, strict=True)], 2000)
+    assert 0.97 * least < found <= least * (1.0 + 1e-3)
 
 
 def test_limits_in_words():

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from caustic_cli.errors import at_most
-from caustic_cli.inverse.deconvolution import FINEST, NO_ERROR, error_bound
+from caustic_cli.inverse.deconvolution import FINEST, NO_ERROR, Blur, error_bound
 from caustic_cli.inverse.lamp import directions_of, pixels_of, wanted
 from caustic_cli.optics.spread import Spread
 from caustic_cli.scene.lamp import Goal, Lamp
@@ -59,7 +59,7 @@ def least_error(lamp: Lamp, goal: Goal, picture: np.ndarray, most: int, beside: 
     blur = Spread((half, half), ((0.0, 0.0, 1.0),), 0.0)
     density = wanted(goal, picture, pixels).numpy() / goal.shares(pixels)
     prices = (0.0,) if math.isinf(beside) else PRICES
-    return max(error_bound(density, [blur.on(pixel, FINEST)], most, price, beside) for price in prices)
+    return max(error_bound(density, [Blur((blur.on(pixel, FINEST),))], most, price, beside) for price in prices)
 
 
 def chip_limits(lamp: Lamp, goal: Goal, picture: np.ndarray, most: int) -> Iterator[str]:

@@ -17,14 +17,14 @@ import torch
 
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import at_most
-from caustic_cli.inverse.deconvolution import BOUND_STEPS, BOUND_WORK, FINEST, NO_ERROR, Deconvolved, deconvolved, error_bound
+from caustic_cli.inverse.deconvolution import BOUND_STEPS, BOUND_WORK, FINEST, NO_ERROR, Blur, Deconvolved, deconvolved, error_bound
 from caustic_cli.inverse.projection import stretching_surface
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.emission.coherent import modes, spots
 from caustic_cli.optics.emission.regular import RegularGrid
 from caustic_cli.optics.screen_shape import normals, points_in_space
-from caustic_cli.optics.source_image import source_images
+from caustic_cli.optics.source_image import Sent, placed_images, source_images
 from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Aperture, CircularAperture, Scene, Source
@@ -58,6 +58,8 @@ POINTS = 12
 LEAST_REACH = 0.5
 #: Least half width of the blur, binned pixels, for the least error.
 BLURRED = 8.0
+#: What the widest image may have beyond the widest that stands for others.
+WIDER = 1.25
 #: Control points along each axis of the offset surface that stands for the lens before it is designed.
 NET = 24
 
@@ -81,33 +83,45 @@ class SourceLimits:
         return "; ".join(found)
 
 
-def performance_limits(scene: Scene, target: np.ndarray, most: int = STANDARD.bound_steps) -> SourceLimits:
+def performance_limits(
+    scene: Scene, target: np.ndarray, most: int = STANDARD.bound_steps, sent: Sent | None = None
+) -> SourceLimits:
     """Limits for any lens under the source of a scene.
 
     target: (n, m) irradiance, or (3, n, m) in colour, whose bound is the mean of its colours', as their error is; most:
-    iterations, as of `error_bound`.
+    iterations, as of `error_bound`; sent: of a lens, whose light others send to about the same places, see `placed_images`.
     """
     scene = scene.unfolded
     if not (scene.source.extended and LIMITS.supports(scene)):
         return SourceLimits(None, None)
-    images = source_images(scene)
-    seen = bool(images) and LEAST_REACH * max(scene.screen.pixel) < max(images[0].reach()) <= max(scene.screen.size)
-    errors = [_least_error(one, images, scene.screen.pixel, most) for one in np.atleast_3d(target.T).T if one.any() and seen]
+    images, pixel, size = source_images(scene), scene.screen.pixel, max(scene.screen.size)
+    seen = bool(images) and LEAST_REACH * max(pixel) < max(images[0].reach()) <= size
+    errors = [_least_error(one, scene, images, sent, most) for one in np.atleast_3d(target.T).T if one.any() and seen]
     error = sum(errors) / len(errors) if errors else 0.0
     return SourceLimits(error if error > NO_ERROR else None, etendue_limit(scene))
 
 
-def _least_error(target: np.ndarray, images: list[Spread], pixel: tuple[float, float], most_steps: int) -> float:
+def _least_error(target: np.ndarray, scene: Scene, images: list[Spread], sent: Sent | None, most_steps: int) -> float:
     """Lower bound of the error of any lens with these images of its source, the sharpest first.
 
-    Where it would take too long, pixels much smaller than the blur are binned: the error of binned images is no larger than theirs.
+    Only the images of light that reaches the lit part of the picture count.  Where it would take too long, pixels much smaller than
+    the blur are binned: the error of binned images is no larger than theirs.
     """
-    (n, m), most = target.shape, max(1.0, min(r / (BLURRED * w) for r, w in zip(images[0].reach(), pixel, strict=True)))
+    pixel, (n, m) = scene.screen.pixel, target.shape
+    most = max(1.0, min(r / (BLURRED * w) for r, w in zip(images[0].reach(), pixel, strict=True)))
+    widest = WIDER * np.max([image.reach() for image in images], axis=0)
+    at = [(np.arange(count) + 0.5 - 0.5 * count) * w for count, w in zip((n, m), pixel, strict=True)]
+    lit = [c[target.any(axis)] for c, axis in zip(at, (1, 0), strict=True)]
+    around = zip(lit, widest, pixel, scene.screen.half_size, strict=True)
+    low, high = zip(*((max(c[0] - r - w, -h), min(c[-1] + r + w, h)) for c, r, w, h in around), strict=True)
+    placed = placed_images(scene, low, high, sent)
     sides = [k for k in range(1, min(n, m) + 1) if n % k == m % k == 0 and k <= most]
-    work = len(images) * target.size * FINEST**2 * BOUND_STEPS
+    work = len(placed) * target.size * FINEST**2 * BOUND_STEPS
     k = next((k for k in sides if work <= BOUND_WORK * k * k), sides[-1])
-    binned = target.reshape(n // k, k, m // k, k).mean((1, 3))
-    return error_bound(binned, [image.on((pixel[0] * k, pixel[1] * k), FINEST) for image in images], most_steps)
+    binned, centres = target.reshape(n // k, k, m // k, k).mean((1, 3)), [c.reshape(-1, k).mean(1) for c in at]
+    cells = (pixel[0] * k, pixel[1] * k)
+    blurs = [Blur(tuple(one.image.on(cells, cut) for cut in (1, FINEST)), torch.from_numpy(one.covers(*centres))) for one in placed]
+    return error_bound(binned, blurs, most_steps)
 
 
 def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int) -> Deconvolved:
