@@ -1,6 +1,7 @@
 """The least error that any light can reach behind an extended source's blur, and what designs reach.
 
     python tests/benchmarks/extended.py            bounds, a minute; prints a Markdown table
+    python tests/benchmarks/extended.py --project LENS.caustic
     python tests/benchmarks/extended.py --designs  with designs at standard quality, judged without their rays' noise; five minutes
 
 Every point of the exit spreads its light over the same disc on the screen, as wide as the throw from there times the angle under
@@ -22,11 +23,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
+from caustic_cli import load
 from caustic_cli.inverse.deconvolution import Deconvolved, deconvolved
+from caustic_cli.inverse.source_limits import performance_limits
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.picture import read_picture
+from caustic_cli.optics.emission.coherent import central_mode
 from caustic_cli.optics.spread import Convolution
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Screen
 
 PICTURES = Path(__file__).resolve().parents[2] / "examples"
@@ -34,6 +41,7 @@ WIDTH, PIXELS, THROW, DISC = 30.0, 250, 300.0, 5.0  # mm; the default lens at ma
 THICKNESS, INDEX = 5.0, 1.5443
 DISTANCES = (5000.0, 2500.0, 1000.0, 500.0)
 STEPS = 3000
+POINTS = 33  # along each axis of a lens' pupil, from which it is known where its light lands
 FINER = 4  # points to a pixel, along each axis, of the disc
 
 
@@ -88,10 +96,41 @@ def designed(name: str, distance: float) -> dict:
     return json.loads(found.stdout)
 
 
+def of_project(path: Path) -> str:
+    """Bounds of the error for a project's scene, of any lens and of those that send their light about where this one does."""
+    lens = load(path)
+    (x, y), (u, v) = landing(lens)
+    known = cKDTree(np.stack([x, y], 1))
+
+    def sent(at: np.ndarray) -> np.ndarray:
+        nearest = known.query(at.T)[1]
+        return np.stack([u[nearest], v[nearest]])
+
+    target = np.asarray(lens.target)
+    whole, alike = (performance_limits(lens.scene, target, sent=how).error for how in (None, sent))
+    return f"{path}: at least {whole:.4f} for any lens, {alike:.4f} for those that send their light about where it does"
+
+
+def landing(lens) -> tuple[np.ndarray, np.ndarray]:
+    """Points (2, N) where light of the source's centre leaves a lens, and where it lands, from the middle of the screen, mm."""
+    scene, heights = lens.scene, {EXIT: torch.as_tensor(lens.heights).double()}
+    system, line = System.of(scene, lens.field), torch.linspace(0.0, 1.0, POINTS, dtype=torch.float64)
+    u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
+    tracer = Tracer(system, central_mode(scene).through(u, v, system.object_space.index_at(None)))
+    landed, left = tracer.land(heights, scene.screen)[0].expanded(), tracer.last(heights).state.expanded()
+    found = [torch.stack(state.full(state.origin)[:2]).numpy() for state in (left, landed)]
+    return found[0], found[1] - np.array(scene.screen.shift)[:, None]
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--designs", action="store_true", help="also design each lens, five minutes")
-    designs = parser.parse_args().designs
+    parser.add_argument("--project", type=Path, action="append", default=[], help="bounds for the scene of a project instead")
+    designs, projects = (given := parser.parse_args()).designs, given.project
+    for path in projects:
+        print(of_project(path), flush=True)
+    if projects:
+        sys.exit()
     print("| picture | distance, mm | blur, mm | a point's lens | the least possible |" + (" designed | time |" if designs else ""))
     print("| --- | --- | --- | --- | --- |" + (" --- | --- |" if designs else ""))
     for name in ("ball", "flame"):
