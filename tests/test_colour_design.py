@@ -74,7 +74,7 @@ def test_powers_have_the_tristimulus_values_of_the_picture(codes, picture):
     colour = colour_science()
     theirs = np.moveaxis(colour.sRGB_to_XYZ(codes / 255.0)[::-1], (0, 1), (2, 1))
     light = Light(wavelengths=RGB, color=True)
-    powers = colours.powers(picture, light)
+    powers = colours.powers(picture.irradiance(), light)
     observer = np.array([colour.wavelength_to_XYZ(w) for w in RGB]).T
     assert powers.shape == (3, 20, 24) and powers.min() >= 0.0
     np.testing.assert_allclose(np.tensordot(observer, powers, 1), theirs, atol=2e-3)  # its matrix of sRGB is rounded
@@ -116,7 +116,7 @@ def test_a_perfect_image_is_the_picture(codes, picture, tmp_path, wavelengths, e
     """On a screen whose pixels are the picture's, at any power: no colour error, and the same codes to 1 of 255."""
     picture = replace(picture, encoding=encoding)
     light = Light(wavelengths=wavelengths, color=True)
-    target = colours.powers(picture, light)
+    target = colours.powers(picture.irradiance(), light)
     image = 0.37 / target.sum() * target
     assert color_figures(scene_of(light), image, target)["ciede2000"] < 1e-6
     write_image(tmp_path / "out.png", *as_viewed(scene_of(light), image, target), encoding)
@@ -131,7 +131,7 @@ def test_a_perfect_image_is_the_picture(codes, picture, tmp_path, wavelengths, e
 
 def test_a_movie_shows_the_colours(codes, picture, tmp_path):
     light = Light(wavelengths=RGB, color=True)
-    target = colours.powers(picture, light)
+    target = colours.powers(picture.irradiance(), light)
     movie = Movie(tmp_path / "a.gif")
     movie.begin(scene_of(light))
     state = State(stage=0, heights=torch.zeros(2, 2), history=[(1, 0, 0.0, 1.0, 0.0)], image=torch.from_numpy(0.2 * target))
@@ -142,7 +142,7 @@ def test_a_movie_shows_the_colours(codes, picture, tmp_path):
 def test_the_colour_error_is_over_the_picture_at_its_luminance(picture):
     """A dark margin does not count, brightness does not, an unlit channel does; by the oracle's formula."""
     colour, light = colour_science(), Light(wavelengths=RGB, color=True)
-    target = colours.powers(picture, light)
+    target = colours.powers(picture.irradiance(), light)
     image = target[:, ::-1] + 0.1 * target.mean()
     found = color_figures(scene_of(light), image, target)["ciede2000"]
     own, goal = (np.moveaxis(xyz_of(a, light), 0, -1) for a in (image, target))

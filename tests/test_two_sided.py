@@ -22,6 +22,7 @@ from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.inverse.two_sided_objective import TwoSidedObjective
 from caustic_cli.io.archive import open_archive
+from caustic_cli.io.colorimetry import XYZ_OF_RGB
 from caustic_cli.kinds import problem_of
 from caustic_cli.kinds.robust import RobustTwoSides
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
@@ -137,18 +138,19 @@ def test_the_loss_has_the_gradients_of_both_sides(second):
         assert (gradient * way).sum() == pytest.approx((ahead - behind) / (2 * step), rel=2e-3, abs=1e-9)
 
 
-@pytest.mark.parametrize("second", [SecondTarget(), SecondTarget(focus=(1.0, 2.0, 200.0))])
+@pytest.mark.parametrize("second", [SecondTarget(), SecondTarget(focus=(1.0, 2.0, 200.0)), SecondTarget(FAR)])
 def test_colours_of_one_index_have_the_loss_of_their_sum(second):
     field, heights = HeightField.of(LENS), torch.stack([torch.zeros(51, 51), torch.full((51, 51), 15.0)]).double()
     bumps = (
         0.02 * torch.randn(heights.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).cumsum(1).cumsum(2) / 51
     )
-    light, found = torch.from_numpy(ONE), []
-    for colours, target in (((), light), ((611.0, 549.0, 464.0), torch.stack([light] * 3))):
+    lights, found = [torch.from_numpy(light) for light in (ONE, TWO)], []
+    for colours in ((), (611.0, 549.0, 464.0)):
+        targets = tuple(torch.stack([light] * 3) if colours else light for light in lights)
         scene = Scene(PlaneWave(), LENS, NEAR, Light(wavelengths=colours, color=bool(colours)), second_target=second)
         rays = rays_of(scene, "grid", 10_000)
         loss = TwoSidedObjective(
-            scene, field, rays, (target,), "rms", LossImage(filter=Filter("cosine", (3, 3))), dtype=torch.float64
+            scene, field, rays, targets, "rms", LossImage(filter=Filter("cosine", (3, 3))), dtype=torch.float64
         )
         one = loss(heights + bumps)
         found.append((one.loss, one.gradient))
@@ -382,6 +384,30 @@ def test_two_pictures_by_the_command_line(_here, capfd, monkeypatch):
     assert again["second_relative_rms"] != seen["second_relative_rms"] and again["relative_rms"] == seen["relative_rms"]
 
 
+def test_two_pictures_in_colour(_here, capfd):
+    """The second target has the tristimulus values of its picture, and each channel of its image is that of a lens of its index."""
+    codes = np.random.default_rng(5).integers(120, 256, (40, 40, 3), dtype=np.uint8)
+    Image.fromarray(codes).save("rgb.png")
+    small = [a if a != "0.2" else "0" for a in SMALL if a != "--linear"]
+    options = ("--second", "rgb.png", "--second-at", "400", "--second-size", "26", "--color", "--glass", "N-SF11")
+    made = run(capfd, "design", "one.png", *small, *options, "--iterations", "2", "-o", "p")
+    assert made["second_relative_rms"] < made["start_second_relative_rms"] and made["second_ciede2000"] > 0
+    project, lens = Project.open("p"), load("p")
+    scene = project.scene()
+    rgb = np.where(codes / 255 <= 0.04045, codes / 255 / 12.92, ((codes / 255 + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    goal = np.tensordot(XYZ_OF_RGB, rgb[::-1].transpose(2, 1, 0), 1)
+    np.testing.assert_allclose(np.tensordot(scene.light.primaries, project.second_target(scene), 1), goal, rtol=1e-9)
+    shown = np.asarray(Image.open("p/render-second.png"))
+    assert shown.ndim == 3 and np.ptp(shown, axis=2).max() > 20
+    coloured, part = lens.scene.onto(lens.scene.second_target.screen), []
+    for wavelength in scene.light.wavelengths:
+        alone = replace(coloured, light=Light()).at(wavelength)
+        part.append(expose(alone, lens.field, lens.heights, rays_of(alone, "grid", 40_000)).image)
+    seen = expose(coloured, lens.field, lens.heights, rays_of(coloured, "grid", 40_000)).image
+    weights = torch.tensor(scene.light.fractions)[:, None, None]
+    assert torch.allclose(seen, weights * torch.stack(part), atol=1e-9 * float(seen.max()))
+
+
 @pytest.mark.parametrize("sun", [(), ("--source-angle", "0.533")])
 def test_a_disc_s_light_is_collimated(_here, capfd, monkeypatch, sun):
     """Of an extended source: no limit is stated by the blur of a surface that is not designed yet."""
@@ -397,7 +423,10 @@ def test_a_disc_s_light_is_collimated(_here, capfd, monkeypatch, sun):
         (("--second-at", "400"), "--second-at belongs to --second"),
         (("--collimate", "--focus", "0,0,300"), "--collimate and --focus both define"),
         (("--collimate", "--mirror"), "--mirror cannot be combined with --collimate"),
-        (("--second", "two.png", "--second-at", "400", "--color"), "the second picture has no colours"),
+        (
+            ("--second", "two.png", "--second-at", "400", "--color", "--wavelengths", "611:1,549:1,464:0"),
+            "--second needs light of 464 nm",
+        ),
         (("--focus", "0,0,20"), "must lie behind the picture's screen at 50 mm"),
         (("--collimate", "--source", "point", "--start", "offset"), "must be transport"),
         (("--second", "missing.png", "--second-at", "400"), "missing.png"),

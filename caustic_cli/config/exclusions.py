@@ -56,7 +56,6 @@ EXCLUDED: dict[str, dict[str, str]] = {
         "source.spectrum": "⟨source.spectrum⟩ is not for a coloured picture, whose three wavelengths are its colours",
     },
     **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
-    "second.z": {"target.color": "⟨target.color⟩ cannot be combined with ⟨second.file⟩: the second picture has no colours"},
     "element": {
         **dict.fromkeys(TRAITS["two sides"].settings, "⟨{path}⟩" + NOT_BESIDE),
         "lens.gradient": "{said}" + NOT_BESIDE,

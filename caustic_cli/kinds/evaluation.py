@@ -48,7 +48,7 @@ class Evaluated:
     #: Tristimulus values of both, (3, n_x, n_y), None for light without colour.
     xyz: np.ndarray | None = None
     waves_xyz: np.ndarray | None = None
-    #: The image on a screen farther away and its target, (k_x, k_y) each, or None.
+    #: The image on a screen farther away and its target, (k_x, k_y) each, or (3, k_x, k_y), or None.
     farther: tuple[np.ndarray, np.ndarray] | None = None
 
     @property

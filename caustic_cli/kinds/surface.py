@@ -89,7 +89,7 @@ class Described(Protocol):
         """The target of each lenslet there, j fastest; a single one for a common picture."""
 
     def second_target(self, scene: Scene) -> np.ndarray | None:
-        """The second target on its screen, or None."""
+        """The second target on its screen, (k_x, k_y), or (3, k_x, k_y) in colour, or None."""
 
 
 def refuse_contradiction(asked: str, d: Defaults) -> None:

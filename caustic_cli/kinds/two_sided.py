@@ -54,7 +54,7 @@ class TwoSides(SeveralSurfaces):
     """Entrance and exit.
 
     Args:
-        second_target: (k_x, k_y) irradiance on the scene's second screen, where it has one.
+        second_target: (k_x, k_y) irradiance on the scene's second screen, or (3, k_x, k_y) in colour, where it has one.
     """
 
     adapts, refines_waves = False, True
@@ -157,7 +157,7 @@ class TwoSides(SeveralSurfaces):
         """Its own initial surfaces say what they cannot reach."""
 
     def transport(self, fixed: bool, seconds: float, rough: bool = False) -> InitialSurface:
-        target = None if self.second_target is None else self.second_target.numpy()
+        target = None if self.second_target is None else grey(self.second_target.numpy())
         return InitialSurface(first_sides(self.scene, grey(self.target.numpy()), target, self.field(0)))
 
     def advice(self, size: tuple[float, float]) -> str:

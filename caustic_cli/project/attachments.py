@@ -140,9 +140,9 @@ def _profile(path: Path, _given: Given) -> _Read:
 
 
 def _second(path: Path, given: Given) -> _Read:
-    """A second picture, encoded and inverted like the first."""
-    linear = given.get("target", {}).get("encoding") == "linear"
-    picture = read_picture(path, linear, invert=given.get("", {}).get("invert", False))
+    """A second picture, encoded, coloured and inverted like the first."""
+    goal = given.get("target", {})
+    picture = read_picture(path, goal.get("encoding") == "linear", bool(goal.get("color")), given.get("", {}).get("invert", False))
     return _Read(picture.encoded(), picture.irradiance(), picture.suffix)
 
 

@@ -16,9 +16,10 @@ from caustic_cli.io.picture import Picture
 from caustic_cli.scene.light import RGB, Light
 
 
-def powers(picture: Picture, light: Light) -> np.ndarray:
-    """Power of each wavelength of the light in each pixel, (3, a, b), in units in which the white of the picture has Y = 1."""
-    return mixture(picture.irradiance(), light.primaries)[0]
+def powers(rgb: np.ndarray, light: Light) -> np.ndarray:
+    """Power of each wavelength of the light in each pixel, (3, a, b), in units in which the white of the picture has Y = 1, of the
+    linear R, G, B (3, a, b) of a picture."""
+    return mixture(rgb, light.primaries)[0]
 
 
 def filled(source: Mapping[str, Any], picture: Picture) -> dict[str, Any]:
@@ -30,7 +31,7 @@ def filled(source: Mapping[str, Any], picture: Picture) -> dict[str, Any]:
     """
     found = {"wavelengths": list(RGB), **source}
     if not found.get("weights"):
-        totals = powers(picture, Light(wavelengths=tuple(found["wavelengths"]), color=True)).sum((1, 2))
+        totals = powers(picture.irradiance(), Light(wavelengths=tuple(found["wavelengths"]), color=True)).sum((1, 2))
         found["weights"] = [float(part) for part in totals / totals.sum()]
     return found
 

@@ -34,7 +34,7 @@ from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, checkpoint, colours
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.completion import complete, complete_source
-from caustic_cli.scene import Scene, sources
+from caustic_cli.scene import Light, Scene, Screen, sources
 from caustic_cli.scene.sources.section import content
 from caustic_cli.schema.table import RoomSettings, SourceSettings, TargetSettings
 
@@ -133,7 +133,7 @@ class Project:
 
     @property
     def second(self) -> np.ndarray | None:
-        """The picture on a screen farther away, irradiance, or None."""
+        """The picture on a screen farther away, irradiance (a, b), or (3, a, b) R, G, B, or None."""
         return content(self.settings.second or {}, "file", np.ndarray)
 
     def room(self, given: Mapping[str, Any]) -> RoomSettings | None:
@@ -192,19 +192,31 @@ class Project:
         t, light = self.settings.target, self.picture.irradiance()
         if t.sheet:
             return np.mean([own / own.sum() for own in self.targets(scene)], axis=0)
-        if t.color:
-            light = colours.powers(self.picture, scene.light)
-            whole = target_on_screen(light.sum(0), t.size, scene.screen, t.flip)
-            parts = [target_on_screen(c, t.size, scene.screen, t.flip) if c.any() else 0.0 * whole for c in light]
-            return np.stack(parts)
-        return target_on_screen(light, t.size, scene.screen, t.flip)
+        return self._of_picture(light, t.size, scene.screen, scene.light)
 
     def second_target(self, scene: Scene) -> np.ndarray | None:
-        """The second target on its screen, (n_x, n_y), or None."""
+        """The second target on its screen, (n_x, n_y), or (3, n_x, n_y) in the colours of the first, or None.
+
+        Raises:
+            InputError: it needs a wavelength of which the source has no light.
+        """
         picture, section = self.second, self.settings.second
         if picture is None or section is None or scene.second_target is None or scene.second_target.screen is None:
             return None
-        return target_on_screen(picture, section.size, scene.second_target.screen, self.settings.target.flip)
+        found = self._of_picture(picture, section.size, scene.second_target.screen, scene.light)
+        for wavelength, part, goal in zip(scene.light.wavelengths, scene.light.fractions, found, strict=False):
+            if scene.colored and goal.any() and not part:
+                raise InputError(f"⟨second.file⟩ needs light of {wavelength:g} nm, of which the source of both pictures has none")
+        return found
+
+    def _of_picture(self, picture: np.ndarray, size: tuple[float, float], screen: Screen, light: Light) -> np.ndarray:
+        """A picture (a, b), or R, G, B (3, a, b), on a screen: (n_x, n_y), or (3, n_x, n_y), the power of each wavelength."""
+        flip = self.settings.target.flip
+        if not self.settings.target.color:
+            return target_on_screen(picture, size, screen, flip)
+        mixed = colours.powers(picture, light)
+        whole = target_on_screen(mixed.sum(0), size, screen, flip)
+        return np.stack([target_on_screen(c, size, screen, flip) if c.any() else 0.0 * whole for c in mixed])
 
     def targets(self, scene: Scene) -> list[np.ndarray]:
         """The target of each lenslet on the screen of the scene, (n_x, n_y), j fastest; a single one for a common picture."""

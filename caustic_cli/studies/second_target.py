@@ -29,13 +29,15 @@ def second_figures(
     device: str = "cpu",
     requests: Requests = NO_REQUESTS,
 ) -> tuple[np.ndarray | None, dict]:
-    """The image on the second screen, power per pixel (n_x, n_y) float64, None where there is none, and figures.
+    """The image on the second screen, power per pixel (n_x, n_y) float64, or (3, n_x, n_y) in colour, None where there is none, and
+    figures.
 
     Args:
         scene: with its lens' designed entrance; heights: (n, m) mm of the exit; target: irradiance on the second screen.
 
     Returns:
-        figures: second_relative_rms, second_noise, second_on_target, second_on_screen and second_of_source of a second picture;
+        figures: second_relative_rms, second_noise, second_on_target, second_on_screen and second_of_source of a second picture, in
+        colour second_ciede2000;
         angle_rms_mrad, the RMS angle to the prescribed directions, weighted by power, for collimated or focused light.
     """
     second = scene.second_target
@@ -43,8 +45,8 @@ def second_figures(
     if second.screen is not None:
         elsewhere = scene.onto(second.screen)
         exposure, found = retrace(elsewhere, field, heights, target, rays=rays, seed=seed, device=device, requests=requests)
-        names = ("relative_rms", "noise", "on_target", "on_screen", "of_source")
-        return exposure.image.cpu().numpy(), {f"second_{name}": found[name] for name in names}
+        names = ("relative_rms", "noise", "on_target", "on_screen", "of_source", "ciede2000")
+        return exposure.image.cpu().numpy(), {f"second_{name}": found[name] for name in names if name in found}
     squares = power = 0.0
     with torch.no_grad():
         for traced in tracers(scene, field, sampler_for(scene, min(rays, ENOUGH), seed, device), torch.float64, CHUNK, requests):

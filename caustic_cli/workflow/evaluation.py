@@ -22,7 +22,7 @@ from caustic_cli.optics.system import trace_arguments
 from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.irradiance import irradiance
-from caustic_cli.studies.retrace import evaluation_rays, retrace, white_level
+from caustic_cli.studies.retrace import evaluation_rays, retrace
 from caustic_cli.studies.viewing import as_viewed, in_colour
 
 design_report, by_waves = OnDemand("caustic_cli.studies.design_report"), OnDemand("caustic_cli.studies.waves")
@@ -55,7 +55,7 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
         write_image(project.path / WAVE, *as_viewed(scene, evaluated.waves, target, evaluated.waves_xyz), encoding, WIDE)
     discard(project.path / FARTHER)
     if evaluated.farther is not None:
-        write_image(project.path / FARTHER, evaluated.farther[0], white_level(*evaluated.farther), encoding, WIDE)
+        write_image(project.path / FARTHER, *as_viewed(scene, *evaluated.farther), encoding, WIDE)
     if not designer.problem.effort.report:
         return evaluated
     history = np.array(state.history, dtype=float).reshape(-1, 5)

@@ -8,8 +8,8 @@ from typing import Any
 from caustic_cli.effort import current_effort
 from caustic_cli.io.picture import write_image
 from caustic_cli.project.project import FARTHER
-from caustic_cli.studies.retrace import white_level
 from caustic_cli.studies.second_target import second_figures
+from caustic_cli.studies.viewing import as_viewed
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
 
@@ -41,5 +41,5 @@ class SecondPicture(Output):
             )
         if light is None:
             return figures
-        write_image(self._path(place), light, white_level(light, target), lens.encoding, place.wide)
+        write_image(self._path(place), *as_viewed(lens.scene, light, target), lens.encoding, place.wide)
         return figures | {"second_image": str(self._path(place))}
