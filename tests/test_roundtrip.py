@@ -49,7 +49,7 @@ from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Component, Disc, Offset, PlaneWave, Points, Scene
+from caustic_cli.scene import Component, Disc, FreeForm, Offset, PlaneWave, Points, Scene
 
 LIMIT = 1e-3  # mm on a screen 300 mm away
 CASE = {"control": (22, 16), "size": (10.0, 8.0), "relief": 0.03}
@@ -519,6 +519,38 @@ def test_the_lighttools_script_builds_this_lens(tmp_path, lens, rays, source, mo
     assert mesh["MaxProgress"] == 1000 and any("BeginAllSimulations" in c[0] for c in calls["Cmd"])
     assert np.load(tmp_path / "lens-lighttools.npy").shape == (64, 50)
     assert all(is_ours(p) for p in companions(path))
+
+
+def test_the_lighttools_script_builds_both_sides(tmp_path, lens, monkeypatch):
+    """Their points are those of scipy's splines, by each side's own knots; a plane wave begins before all of the entrance."""
+    scene, field, heights = lens
+    rng = np.random.default_rng(2)
+    knots = tuple(np.r_[[0.0] * (p + 1), np.sort(rng.random(6)), [1.0] * (p + 1)].tolist() for p in (3, 2))
+    front = FreeForm(rng.uniform(-2.0, -1.2, (10, 9)), (3, 2), knots)
+    scene = replace(scene, source=PlaneWave(), lens=replace(scene.lens, entrance=front, offset=Offset(12.0)))
+    write_lighttools(tmp_path / "lens.npz", scene, field, heights + 8.0, samples=(31, 22))
+    write_script(tmp_path / "lens.npz", scene, field, heights + 8.0, samples=(31, 22))
+    script, block = companions(tmp_path / "lens.npz")
+    monkeypatch.setattr(sys, "argv", ["lens.py"])
+    held: dict = {"__name__": "script", "__file__": str(script)}
+    exec(compile(script.read_text(), script, "exec"), held)
+    archive = dict(np.load(tmp_path / "lens.npz", allow_pickle=False))
+    fake = FakeLightTools()
+    held["build_lens"](fake, archive)
+    held["build_source"](fake, fake, archive)
+    x, y = (np.linspace(-r, r, n) for r, n in zip(scene.lens.half_size, (31, 22), strict=True))
+    over = zip((31, 22), knots, (3, 2), strict=True)
+    u, v = (BSpline.design_matrix(np.linspace(0.0, 1.0, n), t, p).toarray() for n, t, p in over)
+    goal = scene.lens.z_in + u @ front.heights @ v.T
+    calls = {(c[0], c[1].rpartition("[")[2] if c[0].startswith("SetFree") else ""): c for c in fake.calls}
+    found = np.array(calls["SetFreeformSurfacePoints", "FrontSurface]"][2])
+    np.testing.assert_allclose(found[..., 2], goal, atol=1e-12)
+    np.testing.assert_allclose(found[:, 0, 0], x, atol=1e-12)
+    np.testing.assert_allclose(found[0, :, 1], y, atol=1e-12)
+    assert calls["MoveVector", ""][5] <= goal.min() - 1.0
+    words = block.read_text().split("restorePoints:")[1].splitlines()[3:]
+    points = np.array(" ".join(words).partition(" 0 1 4 C")[0].split(), float).reshape(22, 31, 3).swapaxes(0, 1)
+    np.testing.assert_allclose(points[..., 2], goal, atol=1e-12)
 
 
 def test_the_lighttools_block_holds_the_points(tmp_path, lens):

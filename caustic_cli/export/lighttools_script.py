@@ -19,9 +19,10 @@ from caustic_cli.export.surface import Sampling, SurfaceGrid, sample_grid
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import atomic_file, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Scene
 
-#: Points of the flat entrance along each axis.
+#: Points of a flat entrance along each axis.
 FLAT = 5
 #: Points per line of the block.
 WRAP = 4
@@ -41,7 +42,7 @@ import numpy as np
 
 HERE = Path(__file__).resolve().parent
 RAYS = int(float(sys.argv[1])) if len(sys.argv) > 1 else 1_000_000
-BEFORE = 1.0  # a plane wave starts so far before the entrance, mm
+BEFORE = 1.0  # a plane wave starts so far before all of the entrance, mm
 SURFACE = ("LENS_MANAGER[1].COMPONENTS[Components].SOLID[{}].FREEFORM_PRIMITIVE[FreeformPrimitive_1]"
            ".FREEFORM_SURFACE[{}]")
 MESH = "RECEIVER[screen].MESH[1]"
@@ -65,14 +66,11 @@ def main():
 
 
 def build_lens(lt, lens):
-    """A FreeformSolid between the flat entrance and the exit surface's points, u = x, v = y."""
-    (rx, ry), z_in = lens["lens_half_size"], float(lens["z_in"])
+    """A FreeformSolid between the points of the entrance and those of the exit surface, u = x, v = y."""
     lt.Cmd("FreeformSolid XYZ 0,0,0 XYZ 0,0,1 XYZ 0,1,0")
     name = got(lt.DbGet("SOLID[@Last]", "Name"))
-    x, y = (np.linspace(-r, r, @FLAT@) for r in (rx, ry))
-    front = np.stack(np.broadcast_arrays(x[:, None], y[None, :], z_in), -1)  # [nU][nV][3]
     rear = lens["points"].reshape(*lens["shape"], 3)
-    for surface, grid in (("FrontSurface", front), ("RearSurface", rear)):
+    for surface, grid in (("FrontSurface", entrance(lens)), ("RearSurface", rear)):
         lt.SetFreeformSurfacePoints(SURFACE.format(name, surface), grid.tolist(), grid.shape[0], grid.shape[1])
     lt.DbSet("SOLID[@Last]", "Name", "lens")
     index = float(lens["refractive_index"])
@@ -80,15 +78,38 @@ def build_lens(lt, lens):
         print("please give the solid `lens` a material of index %.9g by hand" % index)
 
 
+def entrance(lens):
+    """Points of the entrance, [nU][nV][3]: flat, or of the spline in the archive, as dense as those of the exit."""
+    if "entrance_control_points" not in lens:
+        x, y = (np.linspace(-r, r, @FLAT@) for r in lens["lens_half_size"])
+        return np.stack(np.broadcast_arrays(x[:, None], y[None, :], float(lens["z_in"])), -1)
+    x, y, net = lens["x"], lens["y"], lens["entrance_control_points"]
+    u, v = (basis(lens["entrance_knots_" + k], int(p), np.clip(0.5 * (c / r + 1.0), 0.0, 1.0))
+            for k, p, c, r in zip("uv", lens["entrance_degrees"], (x, y), lens["lens_half_size"]))
+    return np.stack(np.broadcast_arrays(x[:, None], y[None, :], u @ net[..., 2] @ v.T), -1)
+
+
+def basis(t, degree, at):
+    """All B-splines of knots t at parameters, [at][n], by the Cox-de Boor recursion."""
+    span = np.clip(np.searchsorted(t, at, "right") - 1, degree, len(t) - degree - 2)
+    found = (span[:, None] == np.arange(len(t) - 1)).astype(float)
+    for q in range(1, degree + 1):
+        low, high = t[:-q], t[q:]
+        width = np.where(high > low, high - low, 1.0)
+        part = (at[:, None] - low[:-1]) / width[:-1], (high[1:] - at[:, None]) / width[1:]
+        found = part[0] * found[:, :-1] + part[1] * found[:, 1:]
+    return found
+
+
 def build_source(lt, js, lens):
     """A plane wave as a collimated rectangle, points and discs aimed into their cone."""
-    kind, z_in = lens["source_type"].item(), float(lens["z_in"])
+    kind, before = lens["source_type"].item(), float(entrance(lens)[..., 2].min()) - BEFORE
     (rx, ry), cone = lens["lens_half_size"], float(lens["cone_half_angle"])
     if kind == "plane":
-        place(lt, js, "light", (0.0, 0.0, z_in - BEFORE), (2 * rx, 2 * ry), float(lens["source_power"][0]), 0.0)
+        place(lt, js, "light", (0.0, 0.0, before), (2 * rx, 2 * ry), float(lens["source_power"][0]), 0.0)
         return
     if "source_angle" in lens:
-        place(lt, js, "light", (0.0, 0.0, z_in - BEFORE), (2 * rx, 2 * ry), float(lens["source_power"][0]), cone)
+        place(lt, js, "light", (0.0, 0.0, before), (2 * rx, 2 * ry), float(lens["source_power"][0]), cone)
         return
     size = lens.get("source_size", np.full(2, 1e-6))  # a point is a tiny square
     for k, (position, power) in enumerate(zip(lens["source_positions"], lens["source_power"])):
@@ -160,15 +181,23 @@ def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Te
     for word, value in words.items():
         text = text.replace(word, value.replace("\\", "\\\\").replace('"', '\\"'))
     write_bytes(script, text.encode())
-    _write_block(block, scene, sample_grid(field, heights, samples))
+    _write_block(block, _entrance(scene, samples), sample_grid(field, heights, samples))
 
 
-def _write_block(path: Path, scene: Scene, grid: SurfaceGrid) -> None:
-    x, y = (np.linspace(-r, r, FLAT) for r in scene.lens.half_size)
-    flat = np.stack(np.broadcast_arrays(x[:, None], y[None, :], scene.lens.z_in), -1)
+def _entrance(scene: Scene, samples: Sampling | None) -> np.ndarray:
+    """Points of the entrance, (n, m, 3) mm: flat, or as dense as those of the exit."""
+    if scene.lens.entrance is None:
+        x, y = (np.linspace(-r, r, FLAT) for r in scene.lens.half_size)
+        return np.stack(np.broadcast_arrays(x[:, None], y[None, :], scene.lens.z_in), -1)
+    front = entrance_of(scene.lens)
+    grid = sample_grid(front.field, front.heights + scene.lens.z_in, samples)
+    return grid.points.reshape(*grid.z.shape, 3)
+
+
+def _write_block(path: Path, front: np.ndarray, grid: SurfaceGrid) -> None:
     with atomic_file(path, "ascii") as file:
         file.write(f"# {CREATED}; millimetres.  Replace the two restorePoints blocks of a FreeformSolid by these.\n")
-        for points, name in ((flat, "Front"), (grid.points.reshape(*grid.z.shape, 3), "Rear")):
+        for points, name in ((front, "Front"), (grid.points.reshape(*grid.z.shape, 3), "Rear")):
             nu, nv = points.shape[:2]
             file.write(f"restorePoints:\nORAStartData;\n0 0 {nu} {nv} 0 0 {nu * nv} 0 0 0\n")
             rows = points.swapaxes(0, 1).reshape(-1, 3)

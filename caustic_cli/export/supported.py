@@ -78,7 +78,6 @@ SCRIPT = Capability(
     {
         "laser beam": BEAM,
         "user-defined source": SOURCE,
-        "two sides": "⟨script⟩ builds a solid with one free-form side; the archive alone holds both",
         **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
         **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
         "gradient index": SHAPE,
