@@ -8,7 +8,14 @@ import torch
 from scipy.fft import dct
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.parametrisation import MAX_DENSE, SATURATION, UNIFORM_SPREAD, cosine_transform, parametrise
+from caustic_cli.inverse.parametrisation import (
+    MAX_DENSE,
+    SATURATION,
+    UNIFORM_SPREAD,
+    Architecture,
+    cosine_transform,
+    parametrise,
+)
 
 N, M = 6, 5
 
@@ -155,6 +162,27 @@ def test_sparse_layer_is_a_masked_full_matrix(degree):
     jacobian = torch.autograd.functional.jacobian(lambda w: torch.func.functional_call(raw, {"m.weights.0": w}, ()), w0.detach())
     assert torch.equal((jacobian.view(N * M, N * M) != 0).float(), mask)
     assert 0 < float(mask.mean()) <= 1
+
+
+def test_a_sparse_network_of_two_surfaces_is_one_of_each():
+    """Neither sees the other's neurons."""
+    low, high = (torch.stack([b, b]) for b in bounds())
+    both = parametrise(low, high, "sparse", degree=(2, 1))
+    set_randomly(both)
+    assert both.raw().shape == (2, N, M)
+    for side in range(2):
+        one, own = parametrise(low[side], high[side], "sparse", degree=(2, 1)), slice(side * N * M, (side + 1) * N * M)
+        for mine, its in zip((*one.weights, *one.biases), (*both.weights, *both.biases), strict=True):
+            mine.data = its.data[..., own]
+        torch.testing.assert_close(both.raw()[side], one.raw(), rtol=0, atol=1e-6)
+
+
+def test_a_dense_network_of_two_surfaces_by_hand():
+    low, high = (torch.stack([b, b]) for b in bounds())
+    module = parametrise(low, high, "dense", architecture=Architecture(1, 5))
+    set_randomly(module)
+    w, b = list(module.weights), list(module.biases)
+    torch.testing.assert_close(module.raw(), (w[1] @ torch.tanh(w[0] + b[0]) + b[1]).view(2, N, M), rtol=0, atol=1e-6)
 
 
 class Raw(torch.nn.Module):

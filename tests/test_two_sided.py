@@ -384,6 +384,21 @@ def test_two_pictures_by_the_command_line(_here, capfd, monkeypatch):
     assert again["second_relative_rms"] != seen["second_relative_rms"] and again["relative_rms"] == seen["relative_rms"]
 
 
+@pytest.mark.parametrize(
+    "how", [("--network", "sparse"), ("--network", "dense", "--network-width", "16"), ("--optimizer", "adam", "--lr", "1e-4")]
+)
+def test_networks_and_adam_design_both_sides(_here, capfd, how):
+    """Each step is along the gradient of both nets, and a resumed design goes on with the same network."""
+    arguments = ("design", "one.png", *SMALL, *how, "--collimate")
+    whole = run(capfd, *arguments, "--iterations", "8", "-o", "whole")
+    assert whole["relative_rms"] < 0.95 * whole["start_relative_rms"] and whole["iterations"] == 8
+    run(capfd, *arguments, "--iterations", "5", "-o", "parts")
+    run(capfd, "design", "--resume", "parts", "--iterations", "8", "--quiet", "--json")
+    one, two = load("whole"), load("parts")
+    assert torch.allclose(one.heights, two.heights, atol=1e-7)
+    assert np.allclose(one.scene.lens.entrance.heights, two.scene.lens.entrance.heights, atol=1e-7)
+
+
 def test_two_pictures_in_colour(_here, capfd):
     """The second target has the tristimulus values of its picture, and each channel of its image is that of a lens of its index."""
     codes = np.random.default_rng(5).integers(120, 256, (40, 40, 3), dtype=np.uint8)
@@ -422,7 +437,8 @@ def test_a_disc_s_light_is_collimated(_here, capfd, monkeypatch, sun):
         (("--second", "two.png"), "--second needs --second-at"),
         (("--second-at", "400"), "--second-at belongs to --second"),
         (("--collimate", "--focus", "0,0,300"), "--collimate and --focus both define"),
-        (("--collimate", "--mirror"), "--mirror cannot be combined with --collimate"),
+        (("--collimate", "--mirror"), "--mirror cannot be combined with --collimate: a mirror has one side"),
+        (("--focus", "0,0,300", "--network", "dense", "--over", "throw=40:60"), "is given for one scene"),
         (
             ("--second", "two.png", "--second-at", "400", "--color", "--wavelengths", "611:1,549:1,464:0"),
             "--second needs light of 464 nm",

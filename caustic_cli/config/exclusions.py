@@ -20,10 +20,14 @@ _LENSLETS = (
     "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none and optimizer"
     " lbfgs"
 )
-_TWO_SIDES = dict.fromkeys(
-    ("lens.mirror", "lens.gradient", "lens.array", "design.network", "design.optimizer"),
-    "⟨{path}⟩ cannot be combined with ⟨{feature}⟩, which needs two free-form sides of heights by lbfgs",
-)
+_TWO_SIDES = {
+    "lens.mirror": "⟨lens.mirror⟩ cannot be combined with ⟨{feature}⟩: a mirror has one side, and the direction of the light behind"
+    " its picture takes a second one",
+    "lens.gradient": "⟨lens.gradient⟩ cannot be combined with ⟨{feature}⟩, whose initial sides are solved for along straight rays"
+    " between them",
+    "lens.array": "⟨lens.array⟩ cannot be combined with ⟨{feature}⟩: lenslets with two free-form sides each are not implemented",
+    "design.over": "⟨design.over⟩ cannot be combined with ⟨{feature}⟩: what light does behind the picture is given for one scene",
+}
 
 _BOTH = "⟨{feature}⟩ and ⟨{path}⟩ both define the light behind the picture: give one of them"
 _SECOND = (("second.file", "second.collimate", "second.focus"), ("second.collimate", "second.focus"), ("second.focus",))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.ndimage import distance_transform_edt, map_coordinates
 from torch import Tensor
 
 from caustic_cli.optics.emission import rays_of
@@ -58,8 +60,18 @@ def interpolate_scattered(points: np.ndarray, values: np.ndarray, x: np.ndarray,
 
 def entrance_points(scene: Scene, field: HeightField, nets: Tensor) -> Tensor:
     """Entrance point of the ray that leaves at each control point of the exit, over the half size, y before x: (n, m, 2)
-    float64."""
+    float64.  Linear between the means of the rays in cells of AN_ORIGIN rays each, and those of the nearest cell where there is no
+    light."""
     light = internal_rays(scene, field, nets, min(MOST_RAYS, AN_ORIGIN * nets[1].numel()))
+    part = math.sqrt(min(1.0, light.power.size / (AN_ORIGIN * nets[1].numel())))
+    cells = [max(2, round(part * n)) for n in field.shape]
+    lines = [np.linspace(-r, r, n + 1) for r, n in zip(field.half_size, cells, strict=True)]
+    count, *sums = (
+        np.histogram2d(*light.exit[:2], bins=lines, weights=weights)[0] for weights in (None, light.entrance[0], light.entrance[1])
+    )
+    nearest = distance_transform_edt(count == 0, return_distances=False, return_indices=True)
     x, y = np.meshgrid(*(c.numpy() for c in field.control_xy()), indexing="ij")
-    u, v = (c / r for c, r in zip(interpolate_scattered(light.exit[:2], light.entrance, x, y), field.half_size, strict=True))
+    at = [0.5 * (c / r + 1.0) * n - 0.5 for c, r, n in zip((x, y), field.half_size, cells, strict=True)]
+    means = [(total / np.maximum(count, 1))[tuple(nearest)] for total in sums]
+    u, v = (map_coordinates(mean, at, order=1, mode="nearest") / r for mean, r in zip(means, field.half_size, strict=True))
     return torch.from_numpy(np.stack([v, u], -1))

@@ -230,7 +230,8 @@ class SidesTogether(FreeHeights):
 
 
 class NetworkHeights(Heights):
-    """A network with input 1 (5.1.1), and `inputs` more, float32 weights.
+    """A network with input 1 (5.1.1), and `inputs` more, float32 weights; of several surfaces, (k, n, m), one network: a sparse one
+    has a locally connected layer for each.
 
     Args:
         kind: sparse or dense; degree: of the spline, for the kernel of a sparse one.
@@ -254,17 +255,19 @@ class NetworkHeights(Heights):
         super().__init__(low, high)
         self.kind, self.degree = kind, degree
         self.activation = ACTIVATIONS[architecture.activation]
-        n, m = self.net = tuple(low.shape)
-        size, kernel = n * m, (2 * degree[0] + 1) * (2 * degree[1] + 1)
+        self.net = tuple(low.shape)
+        size, kernel = low.numel(), (2 * degree[0] + 1) * (2 * degree[1] + 1)
         if kind == "sparse":
             layers = [(1, (size,), size), (kernel, (kernel, size), size)]  # (fan-in, shape of weights, of biases)
         else:
             widths = [architecture.width or size] * architecture.layers + [size]
             weights = sum(a * b for a, b in itertools.pairwise(widths))
+            net = " x ".join(map(str, self.net))
             if weights > MAX_DENSE:
                 raise InputError(
-                    f"⟨design.network⟩ dense needs {weights:.3g} weights for a {n} x {m} control net; at most {MAX_DENSE:.3g} are"
-                    " supported (16000 control points unless ⟨+design.network_width⟩ says less): use sparse or none"
+                    f"⟨design.network⟩ dense needs {weights:.3g} weights for a {net} control net; at most"
+                    f" {MAX_DENSE:.3g} are supported (16000 control points unless ⟨+design.network_width⟩ says less): use sparse or"
+                    " none"
                 )
             layers = [(1, (widths[0],), widths[0])]
             layers += [(a, (b, a), b) for a, b in itertools.pairwise(widths)]
@@ -296,8 +299,9 @@ class NetworkHeights(Heights):
             x = self.activation(x)
             if self.kind == "sparse":
                 p, q = self.degree
-                net = x.view(-1, 1, *self.net)
+                net = x.view(-1, 1, *self.net[-2:])
                 near = torch.nn.functional.unfold(net, (2 * p + 1, 2 * q + 1), padding=(p, q))  # (k, kernel, n m), zero beyond
+                near = near.view(-1, x.shape[-1] // near.shape[-1], *near.shape[1:]).transpose(1, 2).flatten(2)  # of all surfaces
                 x = (weights * near).sum(-2).view(x.shape) + biases
             else:
                 x = torch.nn.functional.linear(x, weights, biases)

@@ -33,7 +33,7 @@ from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.scene import Scene
-from caustic_cli.schema.table import LensSettings, ScreenSettings, check
+from caustic_cli.schema.table import LensSettings, ScreenSettings, check, default
 from caustic_cli.studies.metrics import judged
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures
@@ -87,6 +87,8 @@ class TwoSides(SeveralSurfaces):
         d.fill_design(preconditioner="laplacian")
         if not d.complete_given_stages():
             stages = refinement(d.lens.control, d.rays, d.resolution, cls.effort_of(d))
+            if not d.plain:
+                stages = [stages[-1] | {"iterations": default("design.stages.iterations"), "tolerance": 0.0}]
             d.set_stages(stages + (wave_stages(d.s, d.source, d.effort, d.lit) if asked == "on" else []))
             return
         refuse_contradiction(asked, d)
@@ -95,7 +97,7 @@ class TwoSides(SeveralSurfaces):
 
     @classmethod
     def default_control(cls, d: Defaults) -> list[int]:
-        return [cls.effort_of(d).spans(max(d.resolution)) + p for p in d.lens.degree]
+        return super().default_control(d) if d.trained else [cls.effort_of(d).spans(max(d.resolution)) + p for p in d.lens.degree]
 
     @classmethod
     def effort_of(cls, d: Defaults) -> Refinement:
@@ -112,7 +114,7 @@ class TwoSides(SeveralSurfaces):
         return torch.stack([-most, low]), torch.stack([most, high])
 
     def parametrised(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
-        if start is None or self.stages[k].waves:
+        if start is None or self.stages[k].waves or not self.options.parametrisation.free:
             return super().parametrised(k, start, loaded)
         light = None if loaded else entrance_points(self.scene, self.field(k), start)
         laplacian = self.options.parametrisation.preconditioner == "laplacian"

@@ -22,8 +22,11 @@ from caustic_cli.scene.traits import Capability
 from caustic_cli.workflow.comparison import picture_of_disc
 from caustic_cli.workflow.preparation import first_heights
 
-ONE_SIDE = "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
-NETWORKS = Capability("study of networks", dict.fromkeys(("two sides", "lenslet array"), ONE_SIDE))
+BY_RAYS = "⟨networks⟩ are compared on ray images, and no stage of this project is on rays"
+NETWORKS = Capability(
+    "study of networks",
+    {"lenslet array": "⟨networks⟩ are compared on a single surface, and every lenslet has its own"},
+)
 #: Grid of hyperparameters: hidden layers, neurons in each, activations, learning rates, and preconditioners of the output.
 LAYERS, WIDTHS, ACTIVATIONS, RATES = (1, 2, 3), (16, 64, 256), ("tanh", "silu"), (3e-4, 1e-3, 3e-3)
 OUTPUTS = ("none", "laplacian")
@@ -97,7 +100,7 @@ def candidates(
     for each value.  Otherwise networks start from the offset surface, and the baselines are free heights by Adam.
 
     Raises:
-        InputError: no stage is on rays, or there are two free-form sides.
+        InputError: no stage is on rays, or there are lenslets.
     """
     study = _Study(project, device, dtype, seed, rays)
     own, over = study.own, study.over
@@ -135,7 +138,7 @@ class _Study:
             self.problem, self.first = prepared.problem, prepared.first
         scene, stages, own = self.problem.scene, [s for s in self.problem.stages if not s.waves], self.problem.options
         if not stages:
-            raise InputError(ONE_SIDE)
+            raise InputError(BY_RAYS)
         NETWORKS.refuse(scene)
         last, control = stages[-1], scene.lens.control
         how = replace(last.rendering, blur=0.0)
