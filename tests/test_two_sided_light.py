@@ -11,13 +11,15 @@ import torch
 from scipy.interpolate import BivariateSpline
 
 from caustic_cli.inverse.initial_two_sided import first_sides
+from caustic_cli.inverse.lens_space import lines_behind
 from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.two_sided_objective import TwoSidedObjective
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import split_heights
-from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Points, Scene, Screen, SecondTarget
+from caustic_cli.scene import Component, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, SecondTarget
+from caustic_cli.scene.elements import FoldMirror
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import together
@@ -29,6 +31,7 @@ LENS = Lens((10.0, 10.0), control=(43, 43), offset=Offset(15.0), height_range=(-
 UPRIGHT = Screen((2 * HALF, 2 * HALF), 50.0, (PIXELS, PIXELS))
 #: Square to light at 10 degrees about y, on its line through the middle of the exit.
 SLOPE = math.tan(math.radians(10.0))
+FARTHER = replace(UPRIGHT, z=300.0)
 SQUARE = replace(UPRIGHT, tilt=(0.0, 10.0), shift=(35.0 * SLOPE, 0.0))
 
 
@@ -90,6 +93,74 @@ def test_another_tracer_finds_the_picture_of_light_at_an_angle(tilt, screen, sec
     assert figures["angle_rms_mrad"] == pytest.approx(1e3 * angle, rel=0.2)  # of few rays, at creases
     seen = retrace(behind, field, exit, target, rays=40_000)[0].image.numpy().reshape(8, 3, 8, 3).sum((1, 3))
     assert np.abs(seen / seen.sum() - fields).max() < 0.06 * fields.max()
+
+
+def sphere(radius: float):
+    """Sag of a sphere through the origin."""
+    return lambda x, y: (x * x + y * y) / radius / (1.0 + np.sqrt(1.0 - (x * x + y * y) / radius**2))
+
+
+BICONVEX = Component(z=32.0, thickness=3.0, size=(20.0, 20.0), radius=(60.0, -90.0), index=1.6)
+MIRROR = FoldMirror(z=46.0, size=(30.0, 30.0), tilt=(0.0, 50.0))
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_another_tracer_goes_along_lines_behind_the_lens_to_the_points(mirror):
+    """Through a lens, and onto a mirror behind it: lines of `lines_behind` arrive at their points, with their slopes."""
+    elements = (BICONVEX, MIRROR) if mirror else (BICONVEX,)
+    scene = Scene(PlaneWave(), LENS, replace(UPRIGHT, z=70.0, tilt=(5.0, 0.0)), elements=elements)
+    rng = np.random.default_rng(4)
+    points = np.stack([*rng.uniform(-5.0, 5.0, (2, 300)), rng.uniform(69.0, 71.0, 300)])
+    slopes = rng.uniform(-0.08, 0.08, (2, 300))
+    at, leaving = lines_behind(scene, points, slopes)
+    d = np.stack([*leaving, np.ones(300)], 1)
+    o, d = (at - (at[2] - 16.0) * d.T).T, d / np.linalg.norm(d, axis=1, keepdims=True)
+    glass = [(sphere(r), (0.0, 0.0, z), (0.0, 0.0), *n) for r, z, *n in ((60.0, 32.0, 1.0, 1.6), (-90.0, 35.0, 1.6, 1.0))]
+    fold = [(lambda x, y: 0.0 * x, (0.0, 0.0, 46.0), (0.0, 50.0), "reflect")] if mirror else []
+    o, d, _ = sequential.walk(o, d, glass + fold)
+    if mirror:  # back to the straight axis: reflected once more, in the plane of the mirror
+        turn = sequential.rotation((0.0, 50.0))[:, 2]
+        middle = np.array([0.0, 0.0, 46.0])
+        o, d = o - 2.0 * ((o - middle) @ turn)[:, None] * turn, d - 2.0 * (d @ turn)[:, None] * turn
+        o, d = o * [-1.0, 1.0, 1.0], d * [-1.0, 1.0, 1.0]  # the axis in the plane of the fold is reversed
+    landed = o + ((points[2] - o[:, 2]) / d[:, 2])[:, None] * d
+    assert np.abs(landed.T - points).max() < 1e-5
+    assert np.abs(d[:, :2].T / d[:, 2] - slopes).max() < 1e-7
+
+
+@pytest.mark.parametrize("second", [SecondTarget(), SecondTarget(focus=(2.0, -1.0, 400.0)), SecondTarget(FARTHER)])
+def test_a_fold_mirror_changes_neither_picture_nor_directions(second):
+    """What is asked of the light along the folded axis is what was along the straight one, reversed in the plane of the fold."""
+    scene, field, found = Scene(PlaneWave(), LENS, UPRIGHT, second_target=second), HeightField.of(LENS), []
+    other = SecondTarget(second.screen, None if second.focus is None else (-second.focus[0], *second.focus[1:]))
+    for folded, way in ((replace(scene, second_target=other), -1), (replace(scene, elements=(replace(MIRROR, z=35.0),)), 1)):
+        goals = [np.ascontiguousarray(a[::way]) for a in (picture(), picture().T)][: 2 if second.screen else 1]
+        light, far = goals[0], goals[1] if second.screen else None
+        own = first_sides(folded, light, far, field, 64)
+        nets = found[0][1] if found else own  # both traced through the same lens
+        behind, exit = split_heights(folded, field, nets)
+        figures = retrace(behind, field, exit, light, rays=40_000)[1]
+        figures |= second_figures(behind, field, exit, far, rays=40_000, seed=1)[1]
+        targets, rays = tuple(map(torch.from_numpy, goals)), rays_of(folded, "grid", 10_000)
+        loss = TwoSidedObjective(folded, field, rays, targets, "rms", LossImage(Filter("cosine", (3, 3))), dtype=torch.float64)(
+            nets
+        )
+        found.append((figures, own, loss.loss, loss.gradient))
+    (straight, one, loss, gradient), (turned, two, other, its) = found
+    assert (one - two).abs().max() < 5e-3 and straight["relative_rms"] < 0.25  # light on the edge of a cell counts in either
+    for key in {"relative_rms", "on_screen", "angle_rms_mrad", "second_relative_rms"} & straight.keys():
+        assert turned[key] == pytest.approx(straight[key], rel=1e-5)
+    assert other == pytest.approx(loss, rel=1e-9) and (gradient - its).norm() < 1e-6 * gradient.norm()
+
+
+@pytest.mark.parametrize("z", [-20.0, 25.0])
+@pytest.mark.parametrize("second", [SecondTarget(), SecondTarget(focus=(1.0, -2.0, 300.0))])
+def test_light_is_collimated_and_focused_beside_another_lens(second, z):
+    """In front of it or behind it, a lens of 100 mm focal length: the picture and the directions are as without it."""
+    lens = replace(BICONVEX, z=z, size=(12.0, 12.0), radius=(100.0, -150.0))
+    scene = Scene(PlaneWave(), LENS, UPRIGHT, second_target=second, elements=(lens,))
+    found = figures_of(scene)
+    assert found["relative_rms"] < 0.25 and found["angle_rms_mrad"] < 3.0 and found["on_screen"] > 0.8
 
 
 def figures_of(scene: Scene, rays: int = 100_000) -> dict:

@@ -26,6 +26,7 @@ _TWO_SIDES = {
     "lens.gradient": "⟨lens.gradient⟩ cannot be combined with ⟨{feature}⟩, whose initial sides are solved for along straight rays"
     " between them",
     "lens.array": "⟨lens.array⟩ cannot be combined with ⟨{feature}⟩: lenslets with two free-form sides each are not implemented",
+    "element.free": "⟨element.free⟩ cannot be combined with ⟨{feature}⟩, which designs both sides of the lens instead",
     "design.over": "⟨design.over⟩ cannot be combined with ⟨{feature}⟩: what light does behind the picture is given for one scene",
 }
 
@@ -60,10 +61,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
         "source.spectrum": "⟨source.spectrum⟩ is not for a coloured picture, whose three wavelengths are its colours",
     },
     **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
-    "element": {
-        **dict.fromkeys(TRAITS["two sides"].settings, "⟨{path}⟩" + NOT_BESIDE),
-        "lens.gradient": "{said}" + NOT_BESIDE,
-    },
+    "element": {"lens.gradient": "{said}" + NOT_BESIDE},
     "element.free": dict.fromkeys(
         ("design.network", "design.optimizer", "target.color", "design.waves on"),
         "{said} cannot be combined with ⟨element.free⟩: it is not implemented beside other free surfaces",

@@ -9,7 +9,8 @@ Screens may be tilted: p and q are points in space, which pictures pair in their
 
 Two pictures determine the map p -> q: to first order in the angles the rays of one wavefront follow the gradient of a convex
 function, and exactly one such map transports one picture to the other (Brenier 1991).  Collimated or focused light determines it
-directly.  The ray of p leaves the exit at e(p) on the straight line through p and q.  This gives the irradiance required on the
+directly.  The ray of p leaves the exit at e(p) on the straight line through p and q, or through their images by other elements
+(`lens_space`).  This gives the irradiance required on the
 exit, to which the entrance is solved by transport, with the exit as a curved screen inside the glass; the exit deflects each ray
 from d to t and is fitted to the slopes required where rays meet it.
 
@@ -30,6 +31,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import on_entrance
 from caustic_cli.inverse.initial_surface import net_of
 from caustic_cli.inverse.internal_rays import internal_rays, interpolate_scattered
+from caustic_cli.inverse.lens_space import lines_behind
 from caustic_cli.inverse.projection import ScreenProjection
 from caustic_cli.inverse.scattered import Pixels
 from caustic_cli.inverse.surface_from_map import slopes_to, surface
@@ -151,7 +153,8 @@ def first_sides(
         slopes = slopes_behind(near, PlacedPicture.on(behind.screen, second))
     else:
         slopes = slopes_towards(near, behind.focus)
-    points, lit = near.points, near.lit
+    points, slopes = lines_behind(scene, near.points, slopes)
+    scene, lit = replace(scene, elements=scene.in_front), near.lit
     px, py, pz = points
     flat = [torch.full(levels[0].field.shape, z, dtype=torch.float64) for z in (0.0, thickness)]
     level, nets = levels[0], torch.stack(flat)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ class InternalRays:
 
 def internal_rays(scene: Scene, field: HeightField, nets: Tensor, count: int) -> InternalRays:
     """About `count` rays of the source on a regular grid, traced inside a lens with these control nets (2, n, m), mm."""
-    lit, net = split_heights(scene, field, nets)
+    lit, net = split_heights(replace(scene, elements=scene.in_front), field, nets)
     found = []
     for traced in tracers(lit, field, rays_of(lit, "grid", count), torch.float64, CHUNK):
         last = traced.last({EXIT: net})

@@ -33,6 +33,7 @@ from caustic_cli.scene import Aperture, Scene
 STEP, NEWTON, LEFT = 1e-6, 8, 1e-6
 #: |B| / L below which the exit is conjugate to the screen, where its slopes do not move light.
 IMAGED = 1e-3
+UNSEEN = "[[element]] the axial ray does not reach the screen from the lens; check the mirrors' tilts and the radii"
 
 
 def without_freeforms(scene: Scene) -> Scene:
@@ -103,9 +104,7 @@ class RelayedScreen:
         q = reach / self.distance * np.array([[0.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0]])
         found = self._from(x, y, np.full(5, self.centre_z), q)
         if not np.isfinite(found).all():
-            raise InputError(
-                "[[element]] the axial ray does not reach the screen from the lens; check the mirrors' tilts and the radii"
-            )
+            raise InputError(UNSEEN)
         a = np.array([found[0, 1] - found[0, 0], found[1, 2] - found[1, 0]]) / reach
         b = np.array([found[0, 3] - found[0, 0], found[1, 4] - found[1, 0]]) / (reach / self.distance)
         if (np.abs(b) < IMAGED * self.distance).any():

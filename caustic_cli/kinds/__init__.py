@@ -18,6 +18,8 @@ from caustic_cli.kinds.surface import Described, OneSurface
 KINDS = (
     ("lens.with_surface", "gradient_index.GradedLens"),
     ("lens.gradient", "gradient_index.IndexPlate"),
+    ("design.robust", "robust.RobustTwoSidesAmongElements"),
+    ("second", "two_sided.TwoSidesAmongElements"),
     ("design.robust", "robust.RobustTwoSides"),
     ("second", "two_sided.TwoSides"),
     ("design.robust", "robust.RobustElements"),

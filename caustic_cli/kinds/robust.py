@@ -12,7 +12,7 @@ from caustic_cli.inverse.robust import robust_objective
 from caustic_cli.kinds.elements import AmongElements, FreeElements
 from caustic_cli.kinds.lenslet_array import LensletArray
 from caustic_cli.kinds.surface import Described, OneSurface
-from caustic_cli.kinds.two_sided import TwoSides
+from caustic_cli.kinds.two_sided import TwoSides, TwoSidesAmongElements
 from caustic_cli.optics import ranks
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.section import content
@@ -63,6 +63,10 @@ class RobustElements(RobustSurface, FreeElements):
 
 class RobustTwoSides(RobustSurface, TwoSides):
     """Entrance and exit, robust."""
+
+
+class RobustTwoSidesAmongElements(RobustSurface, TwoSidesAmongElements):
+    """Entrance and exit among other elements, robust."""
 
 
 class RobustArray(RobustSurface, LensletArray):

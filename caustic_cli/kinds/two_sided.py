@@ -24,6 +24,7 @@ from caustic_cli.inverse.parametrisation import Heights, SidesTogether
 from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.two_sided_objective import TwoSidedObjective
 from caustic_cli.kinds.defaults import Defaults
+from caustic_cli.kinds.elements import AmongElements
 from caustic_cli.kinds.evaluation import Evaluated, radius_figures
 from caustic_cli.kinds.several_surfaces import SeveralSurfaces
 from caustic_cli.kinds.surface import Described, refuse_contradiction
@@ -195,3 +196,21 @@ class TwoSides(SeveralSurfaces):
                 figures |= {"min_radius": radius_figures(self.options.limits.min_radius, initial, unrounded)}
         pair = None if second is None or farther is None else (second, farther)
         return Evaluated(state, judged(figures, refined), image, None if light is None else light.image.cpu().numpy(), farther=pair)
+
+
+class TwoSidesAmongElements(TwoSides, AmongElements):
+    """Entrance and exit, among other elements."""
+
+    @classmethod
+    def applies(cls, s: Settings) -> bool:
+        return TwoSides.applies(s) and AmongElements.applies(s)
+
+    def _bounds(self, k: int) -> tuple[Tensor, Tensor]:
+        low, high = super()._bounds(k)
+        before, lowest = [e.extent[1] for e in self.scene.in_front[-1:]], self.scene.lens.z_in + float(low[0].min())
+        if before and lowest <= before[0]:
+            raise InputError(
+                f"⟨element.z⟩ of the element in front of the lens must end before {lowest:.4g} mm, which the lens' entrance may"
+                f" reach, got a body to {before[0]:.4g} mm"
+            )
+        return low, high

@@ -8,6 +8,7 @@ import math
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.frames import AxisSegment
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.trace import Tracer
@@ -25,7 +26,7 @@ def squared_angular_error(traced: Tracer, state: RayState, scene: Scene) -> Tens
     u, v, along = (_dot(direction, axis) for axis in receiver.axes)
     tangents = [u / along, v / along]
     if scene.second_target is not None and scene.second_target.focus is not None:
-        focus, (x, y, z) = scene.second_target.focus, state.expanded().origin
+        focus, (x, y, z) = (traced.system.leg or AxisSegment()).at(*scene.second_target.focus), state.expanded().origin
         a, b, before = (_dot((x - px, y - py, z + state.datum - pz), axis) for axis in receiver.axes)
         fx, fy, fz = (dot((focus[0] - px, focus[1] - py, focus[2] - pz), axis) for axis in receiver.axes)
         places = [c - before * t for c, t in zip((a, b), tangents, strict=True)]

@@ -282,7 +282,6 @@ BESIDE_ELEMENTS = Capability(
     "other elements",
     {
         **dict.fromkeys(("mirror", "gradient index", "lenslet array"), "⟨{setting}⟩" + NOT_BESIDE),
-        "two sides": "⟨{scene.second_setting}⟩" + NOT_BESIDE,
         "far field": "⟨+throw⟩ inf, a picture in the far field," + NOT_BESIDE,
     },
 )
