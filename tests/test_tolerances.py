@@ -349,6 +349,25 @@ def test_an_upright_scene_is_close():
     assert apart[0] < 0.2 and apart[1] > 1.5
 
 
+@pytest.mark.parametrize("tilt", [(12.0, -7.0), (0.0, 25.0)])
+@pytest.mark.parametrize(
+    "error",
+    [Misalignment(source_tilt=(0.4, -0.3)), Misalignment(lens_tilt=(0.5, 0.2)), Misalignment(lens_shift=(0.6, -0.4), throw=2.0)],
+    ids=["source", "lens", "place"],
+)
+def test_an_upright_scene_is_close_in_tilted_light(tilt, error):
+    plain, field, heights = small()
+    source = PlaneWave(tilt=tilt)
+    x, y, z = source.axis
+    scene = replace(plain, source=source, screen=Screen((34.0, 34.0), 300.0 * z, (32, 32), tilt, (300.0 * x, 300.0 * y)))
+    rays = rays_of(scene, "stratified", 400, 4)
+    (exact,), (still,) = (landing_points(scene, field, heights, rays, e) for e in (error, Misalignment()))
+    near = error.upright(scene)
+    (close,) = landing_points(near, field, heights, rays_of(near, "stratified", 400, 4), Misalignment())
+    apart = [float(torch.hypot(exact.x - o.x, exact.y - o.y).mean()) for o in (close, still)]
+    assert apart[0] < 0.05 and apart[1] > (0.08 if any(error.lens_tilt) else 0.5)  # mm; pixels are of 1 mm
+
+
 @pytest.mark.parametrize(
     "error", [Misalignment(source_tilt=(0.4, -0.3)), Misalignment(lens_tilt=(0.5, 0.2))], ids=["source", "lens"]
 )

@@ -146,6 +146,7 @@ def test_a_fold_mirror_changes_neither_picture_nor_directions(second):
             nets
         )
         found.append((figures, own, loss.loss, loss.gradient))
+    assert folded.unfolded.second_target.focus == other.focus
     (straight, one, loss, gradient), (turned, two, other, its) = found
     assert (one - two).abs().max() < 5e-3 and straight["relative_rms"] < 0.25  # light on the edge of a cell counts in either
     for key in {"relative_rms", "on_screen", "angle_rms_mrad", "second_relative_rms"} & straight.keys():

@@ -85,7 +85,6 @@ EXCLUDED: dict[str, dict[str, str]] = {
             ("lens.gradient free", "element", "design.over"),
             "⟨source.tilt⟩ cannot be combined with ⟨{path}⟩, whose light is along the axis",
         ),
-        "design.robust": "⟨source.tilt⟩ cannot be combined with ⟨design.robust⟩, whose errors are those of light along the axis",
     },
     "design.over": {"design.robust": "⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already"},
 }

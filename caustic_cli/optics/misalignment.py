@@ -35,6 +35,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import CHUNK, Tracer
 from caustic_cli.scene import Pupil, Scene, Screen, Source
+from caustic_cli.scene.room import tilt_of
 from caustic_cli.scene.screen import Window, passed_by
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.several import Several
@@ -148,15 +149,17 @@ class Misalignment:
     def upright(self, scene: Scene) -> Scene:
         """An approximately equivalent scene with the lens in its nominal position, without the thickness error.
 
-        Light from infinity is parallel to the axis, and the screen is decentred by the shift of the picture that its direction
-        causes, without additional tilt; the same holds for a second picture and a focus.  Among other
-        elements the lens stands where it does; light from infinity that a thin lens receives at an angle is replaced by a rotation
-        of all that is behind, and that which other elements receive so is parallel to the axis.
+        Light from infinity along the axis stays parallel to it, and the screen is decentred by the shift of the picture that its
+        direction causes, without additional tilt; the same holds for a second picture and a focus.  Light at an angle is turned
+        itself.  Among other elements the lens stands where it does; light from infinity that a thin lens receives at an angle is
+        replaced by a rotation of all that is behind, and that which other elements receive so is parallel to the axis.
 
         Raises:
             InputError: as of `scene`.
         """
         changed, ahead = self.scene(scene), self._ahead(scene)
+        if scene.source.lean:
+            changed, ahead = replace(changed, source=self._turned(scene, changed.source)), (0.0, 0.0)
         if scene.elements:
             turned = self.source_tilt if scene.source.distant and not scene.in_front else self.lens_tilt
             (sx, sy), (dx, dy), (x, y, z) = scene.screen.shift, self.screen_shift, self.away(scene)
@@ -178,6 +181,13 @@ class Misalignment:
         elif second is not None and second.focus is not None:
             second = replace(second, focus=seen(self.point(scene, second.focus)))
         return replace(changed, screen=moved(scene.screen), second_target=second)
+
+    def _turned(self, scene: Scene, source: Source) -> Source:
+        """A source at infinity whose light has the tilts of source and lens, in the frame of the trace."""
+        if isinstance(source, Several):
+            return replace(source, members=tuple(self._turned(scene, one) for one in source.members))
+        direction = rotate_to_local(self.frame(scene), rotate_to_global(Pose(tilt=self.source_tilt), source.axis))
+        return replace(cast(Any, source), tilt=tilt_of(direction))
 
     def _ahead(self, scene: Scene) -> tuple[float, float]:
         """Slopes of light from infinity by the tilts of source and lens, in the frame of the trace; 0 of other light."""

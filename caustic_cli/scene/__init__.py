@@ -140,7 +140,9 @@ class Scene:
         mirrors = [e for e in self.elements if isinstance(e, FoldMirror) and e.flat]
         if not mirrors or len(mirrors) < len(self.elements):
             return self
-        return replace(self, elements=(), screen=reduce(lambda screen, mirror: mirror.shows(screen), mirrors, self.screen))
+        second = self.second_target and reduce(lambda target, mirror: mirror.shows_target(target), mirrors, self.second_target)
+        screen = reduce(lambda screen, mirror: mirror.shows(screen), mirrors, self.screen)
+        return replace(self, elements=(), screen=screen, second_target=second)
 
     @property
     def free_surfaces(self) -> tuple[str, ...]:

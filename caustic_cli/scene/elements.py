@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 from caustic_cli.errors import InputError, at_least
 from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of, larger
-from caustic_cli.scene.freeform import FreeForm
+from caustic_cli.scene.freeform import FreeForm, SecondTarget
 from caustic_cli.scene.interaction import Reflecting, Refracting
 from caustic_cli.scene.materials import nearest_index
 from caustic_cli.scene.screen import Screen, Window, tilted
@@ -226,6 +226,14 @@ class FoldMirror(Component):
     def flat(self) -> bool:
         """Whether folding the axis is all that it does."""
         return math.isinf(self.radius[0]) and self.free == "none"
+
+    def shows_target(self, target: SecondTarget) -> SecondTarget:
+        """What the light must do behind a screen, as seen in it."""
+        about_x, about_y = map(bool, self.tilt)
+        screen, focus = target.screen, target.focus
+        if focus is not None:
+            focus = (-focus[0] if about_y else focus[0], -focus[1] if about_x else focus[1], focus[2])
+        return SecondTarget(None if screen is None else self.shows(screen), focus)
 
     def shows(self, screen: Screen) -> Screen:
         """A screen as seen in it, from one as seen in the mirrors in front of it."""
