@@ -164,7 +164,7 @@ DRAFT = Effort(
     refinement=Refinement(1.0, 256, 16, 1_000_000, 3, ((1.0, 8),), large=LargePictures(256)),
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
     borders=12,
-    sides=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 30),), large=LargePictures(256, 384)),
+    sides=Refinement(3.0, 512, 64, 1_000_000, 8, ((1.0, 20),)),
     pairs=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 75),), large=LargePictures(256, 384)),
     waves=((4, 12),),
     wave_seconds=8.0,
