@@ -48,9 +48,10 @@ _PLACES = "⟨photo⟩ tells where light left the part by where it lands, which 
 PHOTOGRAPHS = Capability(
     "photographs of a part",
     dict.fromkeys(
-        ("gradient index", "two sides", "other elements", "lenslet array", "coloured picture", "curved screen", "far field"),
+        ("gradient index", "other elements", "lenslet array", "coloured picture", "curved screen", "far field"),
         _MESSAGE,
     )
+    | {"two sides": "⟨photo⟩ tells the form of one surface, and errors of either side of this lens do the same to its picture"}
     | dict.fromkeys(("several sources", "separate places"), _PLACES)
     | {"ray file": "⟨photo⟩ follows rays of their own through each point of the part, and {} are given"},
 )
