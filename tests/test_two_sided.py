@@ -106,6 +106,26 @@ def test_losses_of_the_images_alone_have_gradients_of_both_sides(loss):
     assert bool(torch.isfinite(objective(nets).gradient).all())
 
 
+def test_two_pictures_are_balanced_by_the_fourth_power_of_their_errors():
+    """With t_1 and t_2 of an objective that sees one of them alone, the loss is sqrt((t_1^6 + t_2^6) / (t_1^4 + t_2^4))."""
+    scene, field = Scene(PlaneWave(), LENS, NEAR, second_target=SecondTarget(FAR)), HeightField.of(LENS)
+    nets = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, 15.0, dtype=torch.float64)])
+    rays, targets = rays_of(scene, "grid", 10_000), (torch.from_numpy(ONE), torch.from_numpy(TWO))
+
+    def objective():
+        return TwoSidedObjective(scene, field, rays, targets, "rms-light", LossImage(Filter("cosine", (5, 5))))
+
+    found = []
+    for weights in ((1.0, 0.0), (0.0, 1.0)):
+        one = objective()
+        one.weights = weights
+        found.append(one(nets).loss)
+    a, b = found
+    assert a != pytest.approx(b, rel=0.1)
+    assert objective()(nets).loss == pytest.approx(((a**2 + b**2) / 2.0) ** 0.5, rel=1e-6)
+    assert objective().balanced(nets)(nets).loss == pytest.approx(((a**6 + b**6) / (a**4 + b**4)) ** 0.5, rel=1e-6)
+
+
 @pytest.mark.parametrize("second", [SecondTarget(), SecondTarget(FAR), SecondTarget(focus=(1.0, 2.0, 200.0))])
 def test_the_loss_has_the_gradients_of_both_sides(second):
     """Against central differences along random directions, each side's own and both."""

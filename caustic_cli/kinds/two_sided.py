@@ -127,7 +127,8 @@ class TwoSides(SeveralSurfaces):
             return self.exit_on_waves(scene, k, initial)
         targets = (self.target,) if self.second_target is None else (self.target, self.second_target)
         rays = rays_of(scene, stage.sampler, stage.rays, self.seed(k), self.device)
-        return TwoSidedObjective(scene, self.field(k), rays, targets, o.loss, stage.rendering, limits=o.limits, dtype=o.dtype)
+        found = TwoSidedObjective(scene, self.field(k), rays, targets, o.loss, stage.rendering, limits=o.limits, dtype=o.dtype)
+        return found if k == 0 or len(targets) == 1 else found.balanced(initial)
 
     def exit_on_waves(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
         """The loss of the exit alone on the wave images of both pictures, behind the entrance as it is.
