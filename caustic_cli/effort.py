@@ -89,8 +89,6 @@ class Effort:
     #: improved thin lines from 0.094 to 0.093, 12 spans in the same time to 0.081.  From 1152 spans on the start is evaluated on
     #: finer cells than it is solved on.
     creased: Refinement
-    #: Iterations of an array whose borders between lenslets cross knot spans, and which begins with ripples beside them.
-    borders: int
     #: As `creased` for two free-form sides, on nets that have no ripples as wide as pixels, and with subpixels that show them.
     sides: Refinement
     #: The same for two pictures, which the initial surfaces pair to first order in the angles only: many iterations on a net and
@@ -163,7 +161,6 @@ DRAFT = Effort(
     coarse_to_fine=(15, 25),
     refinement=Refinement(1.0, 256, 16, 1_000_000, 3, ((1.0, 8),), large=LargePictures(256)),
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
-    borders=12,
     sides=Refinement(3.0, 512, 64, 1_000_000, 8, ((1.0, 20),)),
     pairs=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 75),), large=LargePictures(256, 384)),
     waves=((4, 12),),
@@ -177,7 +174,6 @@ STANDARD = Effort(
         large=LargePictures(700, rays_per_pixel=8, most_rays=16_000_000, plan=((1.0, 8),)),
     ),
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
-    borders=30,
     sides=Refinement(3.0, 765, 64, 4_000_000, 8, ((1.0, 20),)),
     pairs=Refinement(1.5, 765, 32, 4_000_000, 4, ((0.5, 60), (1.0, 90))),
     waves=((5, 20), (6, 20)),
@@ -188,7 +184,6 @@ FINE = Effort(
     coarse_to_fine=(40, 120),
     refinement=Refinement(2.0, 957, 256, 16_000_000, 8, ((0.25, 16), (1.0, 16)), large=LargePictures(700)),
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
-    borders=60,
     sides=Refinement(4.0, 1021, 64, 4_000_000, 8, ((1.0, 60),)),
     pairs=Refinement(2.0, 1021, 64, 4_000_000, 6, ((0.25, 100), (1.0, 60))),
     waves=((5, 12), (6, 12), (8, 40)),

@@ -134,19 +134,19 @@ FINE_SPANS = 1024
 LEAST_RAYS = 40_000
 
 
-def creased_control(pixels: int, degree: int, plan: Refinement) -> int:
-    """Control points along an axis for a picture with gaps.
+def creased_control(pixels: int, degree: int, plan: Refinement, pieces: int = 1) -> int:
+    """Control points along an axis for a picture with gaps, or pictures of `pieces` lenslets with so many pixels in all.
 
-    The number of knot spans is a multiple of the cells of the coarse transport solution, increased where it or the number of
-    control points has a large prime factor: the cosine transforms of the initial surface and of the preconditioner are three times
-    as slow for such lengths.
+    The number of knot spans of a piece is a multiple of the cells of the coarse transport solution, increased where it or the
+    number of control points has a large prime factor: the cosine transforms of the initial surface and of the preconditioner are
+    three times as slow for such lengths.
     """
-    spans = plan.spans(pixels)
+    spans = -(-plan.spans(pixels) // pieces)
     step = -(-spans // COARSE)
     spans = -(-spans // step) * step
-    while max(map(_largest_factor, (spans, spans + degree))) > LARGEST_FACTOR:
+    while max(map(_largest_factor, (spans, pieces * (spans + degree - 1) + 1))) > LARGEST_FACTOR:
         spans += step
-    return spans + degree
+    return pieces * (spans + degree - 1) + 1
 
 
 def _largest_factor(n: int) -> int:
@@ -217,12 +217,17 @@ def refinement(
 MORE_LENSLETS = 4
 
 
-def each_lenslet(stages: list[Table], lenslets: int, resolution: tuple[int, int]) -> list[Table]:
+def more_by_lenslets(array: Sequence[int]) -> int:
+    """Factor of the rays where every lenslet of an array is compared with its own picture."""
+    return min(MORE_LENSLETS, math.prod(array))
+
+
+def each_lenslet(stages: list[Table], array: Sequence[int], resolution: tuple[int, int]) -> list[Table]:
     """Stages after a transport start in which every lenslet of an array is compared with its own picture."""
     found = []
     for stage in stages:
-        rays = stage["rays"] * min(MORE_LENSLETS, lenslets)
-        finer = max(1, min(stage["oversample"], math.isqrt(rays // lenslets // (resolution[0] * resolution[1]))))
+        rays = stage["rays"] * more_by_lenslets(array)
+        finer = max(1, min(stage["oversample"], math.isqrt(rays // (math.prod(array) * math.prod(resolution)))))
         found.append(stage | {"rays": rays, "oversample": finer, "lenslets": True})
     return found
 

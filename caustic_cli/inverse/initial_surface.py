@@ -34,9 +34,9 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Aperture, Component, Lens, Scene
 from caustic_cli.scene.elements import SIDES
 
-#: Most cells for which transport is solved.  Where more are needed, as for creases, it is solved on about COARSE, and the map is
-#: evaluated on finer cells.
-SOLVED, COARSE = 1024, 512
+#: Cells on which transport is solved, about, where more than twice as many are needed, as for creases: the map is then evaluated on
+#: finer cells.
+COARSE = 512
 #: See `extended`.
 BESIDE = 0.005
 #: Cells along the lens on which the shadow of its sides is found in tilted light.
@@ -74,12 +74,13 @@ Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class InitialSurface:
-    """An initial surface: control heights (n, m) mm float64, its vertex height, mm, where that was chosen (near sources), and the
-    part of the light that its transport left in wrong places (`transport`, e)."""
+    """An initial surface: control heights (n, m) mm float64, its vertex height, mm, where that was chosen (near sources), the part
+    of the light that its transport left in wrong places (`transport`, e), and of distant light its potential, mm^2."""
 
     heights: Tensor
     middle: float | None = None
     misplaced: float = 0.0
+    potential: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,6 +289,8 @@ def first_surface(
     seconds: float = math.inf,
     few: int = STANDARD.vertex_cells,
     array: Place | None = None,
+    coarse: int = COARSE,
+    similar: np.ndarray | None = None,
 ) -> InitialSurface:
     """Initial surface for a picture, from light of the centre of the source.
 
@@ -295,19 +298,21 @@ def first_surface(
         scene: source, lens and screen.
         target: (n_x, n_y) irradiance on its screen.
         field: spline spaces of the heights.
-        cells: source cells along the lens' longer side; more than SOLVED sharpen creases.
+        cells: source cells along the lens' longer side; more than twice `coarse` sharpen creases.
         fixed: the thickness is given by the user, and no other is tried.
         seconds: approximate time allowed for a near source, which limits its cells.
         few: cells on which the vertex height is chosen for such a source.
         array: the array that the lens belongs to, from whose source its light comes, and its place there.
+        coarse: cells on which the transport is solved, about, where more are needed.
+        similar: potential of a similar surface in distant light, by which this one is found sooner.
 
     Raises:
         InputError: the picture cannot be reached by refraction.
     """
     began = time.monotonic()
     scene, target = seen_by_light(scene, target)
-    times, options = _refinement(cells, target), {}
-    cells = min(cells, SOLVED * times) // times
+    times, options = _refinement(cells, target, coarse), {}
+    cells = min(cells, 2 * coarse * times) // times
     if times > 1:
         options = {"tolerance": EXACT, "most": STEPS}
     grid, lens = _Grid.of(scene, target, cells, array=array), scene.lens
@@ -317,15 +322,15 @@ def first_surface(
         grid = _Grid.of(scene, target, cells, surface)
         z = surface(*grid.places)
     if scene.source.distant or lens.mirror or scene.elements or lens.entrance is not None:
-        found = None
+        known = similar if similar is not None and similar.shape == z.shape else None
+        error = 0.0
         for _ in range(1 if scene.source.distant and not is_traced(scene) else PASSES):
-            known = None if found is None else found.transport.potential
             light, directions = grid.incident(z)
             found = grid.solved(light, directions, float(z.mean()), known, **options)
-            z = found.heights
+            z, known, error = found.heights, found.transport.potential, found.transport.error
         if times > 1:
             grid, z = grid.sharper(found, directions, times)
-        return InitialSurface(net_of(*grid.places, z, field), misplaced=0.0 if found is None else found.transport.error)
+        return InitialSurface(net_of(*grid.places, z, field), misplaced=error, potential=known)
     found, grid = _near_surface(grid, cells, fixed, began + seconds, few, options)
     z = found.z
     if times > 1:
@@ -355,16 +360,16 @@ def _near_surface(grid: _Grid, cells: int, fixed: bool, end: float, few: int, op
     return found, coarse
 
 
-def _refinement(cells: int, target: np.ndarray) -> int:
-    """Refinement factor from the cells on which transport is solved to `cells`; 1 where it is solved on these, or on SOLVED.
+def _refinement(cells: int, target: np.ndarray, coarse: int) -> int:
+    """Refinement factor from the cells on which transport is solved to `cells`; 1 where it is solved on these, or on 2 `coarse`.
 
     A map on finer cells concentrates the light of a site in a point, so that sites have to be finer than bright pixels.
     """
-    needed = max(COARSE, math.sqrt(SITES * np.count_nonzero(target)))
-    if cells <= SOLVED or needed > SOLVED:
+    most, needed = 2 * coarse, max(coarse, math.sqrt(SITES * np.count_nonzero(target)))
+    if cells <= most or needed > most:
         return 1
     whole = max(t for t in range(1, cells) if cells % t == 0 and cells >= NEARLY * needed * t)
-    return whole if cells <= SOLVED * whole else -(-cells // COARSE)
+    return whole if cells <= most * whole else -(-cells // coarse)
 
 
 def _best(grid: _Grid, middle: float, fixed: bool) -> _TruncatedSurface:

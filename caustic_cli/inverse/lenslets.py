@@ -14,9 +14,9 @@ borders meet: they minimise the sum over all borders of the mean square step bet
 
 In square packing borders are knots of multiplicity p (`bspline.open_knots`), where the surface may have a crease, so that the
 control points of a lenslet affect no other.  P_ij are points of the whole net, and neighbours share the ones on their border: the
-remaining steps, at most `AssembledArray.gap`, are averaged.  In hexagonal packing borders cross the knot spans.  The control points
-of the array are then the heights of the lenslet at their places, a variation diminishing spline, which turns steps and creases into
-slopes over p spans, and P_ij follow from the array's points by knot insertion.
+remaining steps, at most `AssembledArray.gap`, are averaged.  In hexagonal packing borders cross the knot spans.  Each control point
+of the array is then that of the lenslet at its place, continued beyond its rectangle, so that steps and creases become slopes over
+p spans, and P_ij follow from the array's points by knot insertion.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import on_entrance, part_within
-from caustic_cli.inverse.initial_surface import first_surface
+from caustic_cli.inverse.initial_surface import COARSE, first_surface
 from caustic_cli.inverse.mixture import Member, Mixture
 from caustic_cli.inverse.objective import Evaluation, LossOfHeights
 from caustic_cli.optics import ranks
@@ -79,6 +79,11 @@ class SplineSection:
         at = (low + (high - low) * own.greville).clamp(low + KNOT_RESOLUTION, high - KNOT_RESOLUTION)
         return cls(own, where, own.interpolated(whole.matrix(at)[:, where]))
 
+    @property
+    def inverse(self) -> Tensor | None:
+        """What its control points are multiplied by for those of the other: its ends are continued as polynomials."""
+        return None if self.matrix is None else torch.linalg.inv(self.matrix)
+
 
 def _along(matrices: Sequence[Tensor | None], net: Tensor) -> Tensor:
     """A net (n, m) times a matrix along each axis; None for the unit matrix."""
@@ -109,6 +114,10 @@ class Lenslet:
     def of(self, net: Tensor) -> Tensor:
         """Its control net, of a net (n, m) of the array."""
         return _along([s.matrix for s in self.sections], net[self.where])
+
+    def into(self, net: Tensor) -> Tensor:
+        """The control points of the array on which it depends, of its control net."""
+        return _along([s.inverse for s in self.sections], net)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,8 +264,8 @@ def assemble(nets: Sequence[Tensor], array: tuple[int, int]) -> AssembledArray:
 
 
 def sampled(parts: Sequence[Lenslet], nets: Sequence[Tensor], lens: Lens, field: HeightField) -> AssembledArray:
-    """The variation diminishing spline of an array, whose control points are heights of the lenslets with these nets; `gap` is
-    between the lenslets of neighbouring control points, at the first of them."""
+    """The array whose control points are those of the lenslets with these nets, each of the lenslet at its place; `gap` is between
+    the lenslets of neighbouring control points, at the first of them."""
     at = [c.contiguous() for c in torch.meshgrid(*field.control_xy(), indexing="ij")]
     owner = lens.cells.number(*at).long()
     net, borders = torch.zeros(owner.shape, dtype=torch.float64), []
@@ -275,8 +284,8 @@ def sampled(parts: Sequence[Lenslet], nets: Sequence[Tensor], lens: Lens, field:
         for numbers, values in ((one, first), (two, second)):
             of = (numbers == k).nonzero()[:, 0]
             values[of] = height(k, x[of], y[of])
-        mine = owner == k
-        net[mine] = height(k, at[0][mine], at[1][mine])
+        mine = owner[parts[k].where] == k
+        net[parts[k].where][mine] = parts[k].into(nets[k])[mine]
     pair, of = torch.unique(torch.minimum(one, two) * len(parts) + torch.maximum(one, two), return_inverse=True)
     rise = torch.where(one < two, first - second, second - first)
     wanted = torch.zeros(len(pair), dtype=torch.float64).index_add(0, of, rise) / torch.bincount(of, minlength=len(pair))
@@ -285,14 +294,16 @@ def sampled(parts: Sequence[Lenslet], nets: Sequence[Tensor], lens: Lens, field:
     return AssembledArray(net + raised[owner], float(left.abs().max()) if len(left) else 0.0)
 
 
-def initial_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[int, int], cells: int) -> AssembledArray:
+def initial_array(
+    scene: Scene, targets: Sequence[np.ndarray], control: tuple[int, int], cells: int, coarse: int = COARSE
+) -> AssembledArray:
     """Initial surface of an array by optimal transport, solved for each lenslet.
 
     Args:
         scene: source, lens and screen of the whole.
         targets: (n_x, n_y) irradiance on the screen, of each lenslet, j fastest; or one for all.
         control: points of the array's net.
-        cells: source cells along a lenslet's longer side.
+        cells, coarse: source cells along a lenslet's longer side, as of `first_surface`.
 
     Raises:
         InputError: as of `lenslets` and `first_surface`.
@@ -300,10 +311,14 @@ def initial_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[in
     parts, lens = lenslets(scene, control), scene.lens
     whole = replace(scene, lens=replace(lens, array=(1, 1)))
     each = targets if len(targets) == len(parts) else [targets[0]] * len(parts)
-    nets = []
+    nets, known = [], dict[tuple, np.ndarray | None]()  # of a picture and a net of this shape, in the light of another lenslet
     for one, goal in zip(parts, each, strict=True):
         place = None if scene.source.distant or scene.source.by_lenslet else (whole, one.middle)
-        nets.append(first_surface(one.scene, goal, one.field, cells, fixed=True, array=place).heights)
+        alike = id(goal), one.field.shape
+        light = {"array": place, "similar": known.get(alike)}
+        found = first_surface(one.scene, goal, one.field, cells, fixed=True, coarse=coarse, **light)
+        nets.append(found.heights)
+        known[alike] = found.potential
     if lens.pieces == lens.array:
         return assemble(nets, lens.array)
     return sampled(parts, nets, lens, HeightField.of(replace(lens, control=control)))

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config.default_stages import Table, each_lenslet
+from caustic_cli.config.default_stages import Table, each_lenslet, more_by_lenslets
 from caustic_cli.config.exclusions import refuse_excluded
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.initial_surface import InitialSurface
+from caustic_cli.inverse.initial_surface import COARSE, InitialSurface
 from caustic_cli.inverse.lenslets import array_objective, initial_array, lenslets
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.target import grey
@@ -82,31 +82,17 @@ class LensletArray(OneSurface):
 
     @classmethod
     def has_creases(cls, d: Defaults) -> bool:
-        return super().has_creases(d) or cls._borders_cross(d)
-
-    @classmethod
-    def _borders_cross(cls, d: Defaults) -> bool:
-        """Whether the borders of lenslets cross knot spans."""
-        return cls.pieces(d) != tuple(d.lens.array)
+        return True  # at the borders of lenslets, and each of them has few knot spans
 
     @classmethod
     def least_rays(cls, d: Defaults) -> int:
-        """One for each knot span, so that no step between lenslets hides between rays."""
-        return math.prod(d.lens.control) if cls._borders_cross(d) else 0
-
-    @classmethod
-    def refinement(cls, d: Defaults, creased: bool = False) -> list[Table]:
-        stages = super().refinement(d, creased)
-        least = d.effort.borders if cls._borders_cross(d) else 0
-        return [stage | {"iterations": max(least, stage["iterations"])} for stage in stages]
+        """One for each knot span, so that nothing hides between rays; stages by lenslets have more of them than others."""
+        return math.prod(d.lens.control) // (more_by_lenslets(d.lens.array) if cls.by_lenslets(d) else 1)
 
     @classmethod
     def creased(cls, d: Defaults, waves: list[Table]) -> bool:
         blurred = d.source.by_lenslet and max(d.source.extent) > 0  # so near that creases are smooth whatever the net
-        creased = not blurred and super().creased(d, waves)
-        if creased:
-            d.set_control(cls.fitting(d))
-        return creased
+        return not blurred and super().creased(d, waves)
 
     @classmethod
     def by_lenslets(cls, d: Defaults) -> bool:
@@ -122,7 +108,7 @@ class LensletArray(OneSurface):
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
         stages = cls.refinement(d, cls.creased(d, waves))
         if cls.by_lenslets(d):
-            stages = each_lenslet(stages, math.prod(d.lens.array), d.resolution)
+            stages = each_lenslet(stages, d.lens.array, d.resolution)
         return stages
 
     def takes_lenslets(self, k: int) -> bool:
@@ -138,5 +124,6 @@ class LensletArray(OneSurface):
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
         goals = [grey(target.numpy()) for target in self.targets] or [goal]
-        cells = max(self.effort.lenslet_cells, cells // max(scene.lens.array))
-        return InitialSurface(initial_array(scene, goals, self.stages[0].control, cells).heights)
+        most, least = max(scene.lens.array), self.effort.lenslet_cells
+        coarse = max(least, 2 * COARSE // most)  # so that the cells of all are as many as of one lens
+        return InitialSurface(initial_array(scene, goals, self.stages[0].control, max(least, cells // most), coarse).heights)

@@ -262,19 +262,25 @@ class OneSurface(Problem):
 
     @classmethod
     def creased(cls, d: Defaults, waves: list[Table]) -> bool:
-        """Whether the picture has dark gaps, or borders are not on knots, for whose creases the control net is then made fine.
+        """Whether the surface has creases, for which the control net is then made fine.
 
         Diffraction and extended sources smooth creases more than a coarser net.
         """
         creased = cls.has_creases(d) and not (d.own_control or waves or d.shaped or cls.spread(d))
         if creased:
             plan = d.effort.creased if d.by_rows else d.effort.creased.coarser
-            d.set_control([creased_control(max(d.resolution), p, plan) for p in d.lens.degree])
+            along = zip(d.lens.degree, d.lens.array, cls.pieces(d), strict=True)
+            d.set_control([creased_control(max(d.resolution) * n, p, plan, k) for p, n, k in along])
         return creased
+
+    @staticmethod
+    def pieces(d: Defaults) -> tuple[int, int]:
+        """Pieces along x and y between which the knots of its spline permit creases."""
+        return (1, 1)
 
     @classmethod
     def has_creases(cls, d: Defaults) -> bool:
-        """Whether the surface has creases where its spline has none."""
+        """Whether the surface has creases where its spline has none: by dark gaps of the picture."""
         return d.gaps >= GAPS
 
     @classmethod
