@@ -135,9 +135,13 @@ class RoundLenslets(PartAperture):
 
     def contains(self, x, y):
         """As of an aperture."""
+        return self.margin(x, y) >= 0.0
+
+    def margin(self, x, y):
+        """Signed distances of points from the edges of the circles, mm, positive inside."""
         assert self.cells is not None
         a, b = self.cells.centre(*self.cells.index(x, y))
-        return (x - a) ** 2 + (y - b) ** 2 <= self.cells.radius**2
+        return self.cells.radius - library(x).hypot(x - a, y - b)
 
     def scaled(self, factor: float) -> Aperture:
         """As of an aperture."""

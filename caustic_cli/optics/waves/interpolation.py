@@ -76,18 +76,27 @@ class Lit:
     edge_y: Tensor | None
     #: 0 where light is blocked behind the pupil, 1 elsewhere; None if nothing is blocked.
     shade: Tensor | None
+    #: Signed distance to the edges of a mask on the exit, mm, positive where it is clear; None without one.
+    mask: Tensor | None = None
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> Lit:
         """The same with a function applied to everything."""
-        return Lit(*(None if c is None else function(c) for c in (self.edge_x, self.edge_y, self.shade)))  # type: ignore[arg-type]
+        return Lit(*(None if c is None else function(c) for c in vars(self).values()))  # type: ignore[arg-type]
 
     def fraction(self, step: tuple[float, float]) -> Tensor:
         """Lit fraction of each cell of widths `step`, mm."""
-        if self.edge_y is None:
-            lit = (self.edge_x / (0.5 * (step[0] + step[1])) + 0.5).clamp(0.0, 1.0)
-        else:
-            lit = (self.edge_x / step[0] + 0.5).clamp(0.0, 1.0) * (self.edge_y / step[1] + 0.5).clamp(0.0, 1.0)
+        mean = 0.5 * (step[0] + step[1])
+        lit = _within(self.edge_x, step[0] if self.edge_y is not None else mean)
+        if self.edge_y is not None:
+            lit = lit * _within(self.edge_y, step[1])
+        if self.mask is not None:
+            lit = lit * _within(self.mask, mean)
         return lit if self.shade is None else lit * self.shade.clamp(0.0, 1.0)
+
+
+def _within(distance: Tensor, width: float) -> Tensor:
+    """Lit fraction of cells of a width whose middles are at signed distances from an edge, mm."""
+    return (distance / width + 0.5).clamp(0.0, 1.0)
 
 
 @dataclass

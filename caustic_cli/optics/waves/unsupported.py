@@ -16,13 +16,11 @@ class NoWaveImage(CausticError):
     """The wave image of a scene is undefined, or cannot be computed."""
 
 
-MASKED = "light is diffracted by the edge of every round lenslet, and a field is computed behind the edge of one aperture"
 #: Why a scene has no wave image, as clauses.
 WAVE_IMAGE = Capability(
     "wave image",
     {
         **dict.fromkeys(("ray file", "ray file among sources"), "a ray file contains no phase"),
-        "round lenslets": MASKED,
     },
 )
 WAVE_REFINEMENT = Capability(
@@ -32,7 +30,6 @@ WAVE_REFINEMENT = Capability(
             ("ray file", "ray file among sources"),
             "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
         ),
-        "round lenslets": f"⟨design.waves⟩ on: {MASKED}",
     },
 )
 WAVES_BY_DEFAULT = Capability(

@@ -50,6 +50,7 @@ from caustic_cli.optics.waves.interpolation import FineWavefront, Lit, extrapola
 from caustic_cli.optics.waves.ray_aiming import aimed_rays
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Pupil
+from caustic_cli.scene.packing import RoundLenslets
 from caustic_cli.scene.screen import passed_by
 
 interpolate_nd = OnDemand("scipy.interpolate")
@@ -146,6 +147,16 @@ class Optics:
             imaged = ImagedExit.fitted(at, (f.big_x[lit], f.big_y[lit]), (f.qx[lit], f.qy[lit]), self.distance)
         return replace(self, distance=imaged.distance, imaged=imaged)
 
+    @cached_property
+    def unmasked(self) -> tuple[System, RoundLenslets | None]:
+        """The system without a mask on its exit, through which rays are traced, and the mask, None if there is none."""
+        masks = [e.aperture for e in self.system.elements if e.name == EXIT and isinstance(e.aperture, RoundLenslets)]
+        if not masks:
+            return self.system, None
+        clear = self.system.pupil.aperture
+        elements = tuple(replace(e, aperture=clear) if e.aperture in masks else e for e in self.system.elements)
+        return replace(self.system, elements=elements), masks[0]
+
     @property
     def index(self) -> float:
         """Refractive index of the image space."""
@@ -155,13 +166,14 @@ class Optics:
         """Rays through points (N,) of the pupil at the lens' exit, or where there is none at the last element, and at that; behind
         the interaction."""
         rays = self.mode.through(u, v, self.system.object_space.index_at(self.label))
-        return Tracer(self.system, rays, requests=STAGES, wavelength=self.label).ends(self.parameters)
+        return Tracer(self.unmasked[0], rays, requests=STAGES, wavelength=self.label).ends(self.parameters)
 
     def intercepts(self, u: Tensor, v: Tensor, sensitive: bool = False) -> Intercepts:
         """Intercepts of the rays through points (N,) of the pupil; sensitive: with those at the last surface."""
         if torch.is_grad_enabled() or len(u) <= CHUNK:
             met, last = self.interactions(u, v)
-            return _with_exit(met, self.intercepts_of(last)) if sensitive else self.intercepts_of(last)
+            with_exit = sensitive or self.unmasked[1] is not None
+            return _with_exit(met, self.intercepts_of(last)) if with_exit else self.intercepts_of(last)
         found: Intercepts | None = None
         for start in range(0, len(u), CHUNK):
             part = slice(start, start + CHUNK)
@@ -460,6 +472,8 @@ def wavefront(
     path = torch.where(known, path - path[~dark].detach().mean(), torch.zeros_like(path))
     apart, at = (ex.view(shape), ey.view(shape)), (x.view(shape), y.view(shape))
     density, lit = _density(optics.mode.scene.pupil, seen, held, apart, at, f.power.view(shape), dark.view(shape), step)
+    if (mask := optics.unmasked[1]) is not None and f.at_x is not None and f.at_y is not None:
+        lit = replace(lit, mask=mask.margin((f.at_x + ex).detach(), (f.at_y + ey).detach()).view(shape))
     big_x, big_y = (c.detach().view(shape) for c in (f.big_x, f.big_y))
     return Wavefront(low, step, path.view(shape), density, lit, (big_x, big_y), last)
 
