@@ -260,8 +260,8 @@ def arrays(tmp_path_factory):
         goal[:12, :12], goal[12:, 12:] = 255, 102
         Image.fromarray(np.ascontiguousarray(goal.T[::-1])).save("goal.png")
         common = "--resolution 32 --iterations 2 --quality draft --quiet --threads 2"
-        assert cli.run(shlex.split(f"design blob.png --array 2x3 {common}")) == 0
-        assert cli.run(shlex.split(f"design sheet.png --linear --sheet --array 2 {common}")) == 0
+        assert cli.run(shlex.split(f"design blob.png --array 2x3 --control 101x151 {common}")) == 0
+        assert cli.run(shlex.split(f"design sheet.png --linear --sheet --array 2 --control 133 {common}")) == 0
         assert cli.run(shlex.split(f"design blob.png -o single.caustic --resolution 24 --start offset --control 8 {common}")) == 0
         yield directory
 

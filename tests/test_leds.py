@@ -153,7 +153,7 @@ def leds(tmp_path_factory):
         left, right = (np.exp(-6.0 * ((x - a) ** 2 + y**2)) + 0.02 for a in (-0.5, 0.5))
         np.save("sheet.npy", np.concatenate([left, right], 0))
         np.save("goal.npy", left + 0.4 * right)
-        assert cli.run(shlex.split(f"design sheet.npy --sheet {ARRAY} {EACH} {SMALL} -o p.caustic")) == 0
+        assert cli.run(shlex.split(f"design sheet.npy --sheet {ARRAY} --control 83x43 {EACH} {SMALL} -o p.caustic")) == 0
         yield directory
 
 

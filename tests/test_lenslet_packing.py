@@ -13,6 +13,7 @@ from scipy.interpolate import BSpline
 
 import caustic_cli as caustic
 from caustic_cli import cli
+from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.lenslets import SplineSection, array_objective, initial_array, lenslets, sampled
 from caustic_cli.inverse.objective import Objective
@@ -21,6 +22,7 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.project.completion import complete
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.packing import ConvexAperture, cells_of
 from caustic_cli.studies.retrace import retrace
@@ -183,6 +185,23 @@ def test_the_initial_surface(lenslets_, source, most):
     assert error < most
 
 
+# The default net
+
+
+@pytest.mark.parametrize("packing", ["square", "hexagonal"])
+@pytest.mark.parametrize("gaps", [0.0, 0.9])
+def test_lenslets_have_the_spans_per_pixel_of_one_lens(packing, gaps):
+    """As far as the largest net of the quality goes, whatever the picture, and a ray for each of them."""
+    for array, pixels in (((2, 2), 40), ((3, 2), 60), ((5, 5), 100)):
+        lens = {"array": list(array), "packing": packing}
+        full = complete({"lens": lens, "screen": {"resolution": [pixels, pixels]}}, 1.0, gaps=gaps)
+        stage = full.design.stages[-1]
+        plan = current_effort().creased
+        for n, k in zip(full.lens.control, array, strict=True):
+            assert n - 3 >= min(plan.spans_per_pixel * pixels * k, plan.most_spans)
+        assert list(stage.control) == list(full.lens.control) and stage.rays >= math.prod(full.lens.control)
+
+
 # The program
 
 
@@ -193,7 +212,7 @@ def arrays(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(directory)
         write_blob()
-        common = "--packing hexagonal --resolution 24 --iterations 1 --quality draft --quiet --threads 2"
+        common = "--packing hexagonal --control 99 --resolution 24 --iterations 1 --quality draft --quiet --threads 2"
         assert cli.run(shlex.split(f"design blob.png --array 2 {common}")) == 0
         assert cli.run(shlex.split(f"design blob.png --array 2x1 --lenslets round -o round.caustic --lens-size 2 {common}")) == 0
         yield directory

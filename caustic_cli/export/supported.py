@@ -41,9 +41,8 @@ _UNSUPPORTED: dict[str, Mapping[str, str]] = {
             ("mirror", "gradient index", "other elements", "folded axis", "several sources"),
             "⟨format⟩ phase is that of one lens for one source, not of {}",
         ),
-        **dict.fromkeys(
-            ("ray file", "curved screen", "round lenslets"), "⟨format⟩ phase needs a wave image, which there is none of with {}"
-        ),
+        **dict.fromkeys(("ray file", "curved screen"), "⟨format⟩ phase needs a wave image, which there is none of with {}"),
+        "round lenslets": "⟨format⟩ phase is that of a lens that is clear all over, not {}",
     },
     "mitsuba": {
         "laser beam": BEAM,
