@@ -51,7 +51,7 @@ def in_tmp(tmp_path, monkeypatch):
 
 
 def design(*options: str) -> int:
-    small = ("--quality", "draft", "--resolution", "24", "--waves", "off", "--rays", "20000")
+    small = ("--quality", "draft", "--resolution", "24", "--control", "99x51", "--waves", "off", "--rays", "20000")
     return cli.run(["design", "sheet.npy", *SUNDIAL, *small, "-o", "p", *options])
 
 
