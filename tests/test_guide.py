@@ -99,8 +99,10 @@ def test_the_commands_of_a_chapter_run(chapter, home, monkeypatch, capfd):
         where = few.index("2>") if "2>" in few else len(few)
         if "--screen" in few or "window-floor" in few or "sundial" in few:  # which say where the screen is
             monkeypatch.delenv("CAUSTIC_DESIGN_THROW")
-        if "--config" in few or "--array" in few:  # which say how many control points there are, or for how many lenslets
+        if "--config" in few:  # which says how many control points there are
             monkeypatch.delenv("CAUSTIC_DESIGN_CONTROL")
+        elif "--array" in few:  # which 3 or 5 lenslets share
+            monkeypatch.setenv("CAUSTIC_DESIGN_CONTROL", "106")
         if "--lamp" in few or {"street", "spot", "headlamp"} & {*few}:  # which have no settings of a height field
             for name in OF_HEIGHT_FIELDS:
                 monkeypatch.delenv(name, raising=False)
