@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from caustic_cli.optics.kernels.filter_weights import KINDS
+from caustic_cli.optics.kernels.transfer import TargetPlane
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
 
@@ -45,14 +46,12 @@ class ScreenFrame(NamedTuple):
 
 
 class Point(NamedTuple):
-    """A source point behind the flat entrance, for the rays of `pencil`.
+    """A source point behind the flat entrance, at the zero of x and y.
 
-    x, y: mm; distance: h, mm; n: index of the entrance; steps: of Newton's iteration; scale: 2 / largest s; emission: coefficients
+    distance: h, mm; n: index of the entrance; steps: of Newton's iteration; scale: 2 / largest s; emission: coefficients
     of J, the highest first; see `optics.pencil`.
     """
 
-    x: float
-    y: float
     distance: float
     n: float
     steps: int
@@ -60,38 +59,19 @@ class Point(NamedTuple):
     emission: np.ndarray
 
 
-class Components(NamedTuple):
-    """Components of a vector."""
-
-    x: float
-    y: float
-    z: float
-
-
 class ParallelLight(NamedTuple):
-    """Parallel light behind a flat entrance, for the rays of `beam`, and the plane of the screen.
+    """Parallel light behind a flat entrance, see `optics.beam`, and the plane of the screen, above the zero of the sag.
 
-    kx, ky: k; long2: L^2; power: E T, 1/mm^2; over_x, over_y: 1 / half widths of the entrance, 1/mm; round: whether its aperture is
-    a circle; e1, e2, e3: axes of the screen, the third normal to it; c1, c2, c3: a point of it along these, mm, where its
-    coordinates are 0, above the zero of the sag; on1, on2, on3: D along these.
+    kx, ky: k; power: E T, 1/mm^2; over_x, over_y: 1 / half widths of the entrance, 1/mm; round: whether its aperture is a circle.
     """
 
     kx: float
     ky: float
-    long2: float
     power: float
     over_x: float
     over_y: float
     round: bool
-    e1: Components
-    e2: Components
-    e3: Components
-    c1: float
-    c2: float
-    c3: float
-    on1: float
-    on2: float
-    on3: float
+    plane: TargetPlane
 
 
 class Splat(NamedTuple):

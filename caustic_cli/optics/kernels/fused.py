@@ -5,14 +5,14 @@ Everything is float64, since float32 was no faster.
 
 Each of a fixed number of blocks of rows accumulates an image of its own, and these are added in order, so the result depends on the
 number of blocks (threads) but not on timing.  Only the scatter to and the gather from pixels are per ray; the rest (`rows`,
-`axial_refraction`, `oblique_refraction`, `pencil` or `beam`, `filter_weights`) is vectorised over rows.
+`axial_refraction` or `landing`, `filter_weights`) is vectorised over rows.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from caustic_cli.optics.kernels import axial_refraction, beam, oblique_refraction, pencil
+from caustic_cli.optics.kernels import axial_refraction, landing
 from caustic_cli.optics.kernels import rows as row
 from caustic_cli.optics.kernels.arguments import Splat
 from caustic_cli.optics.kernels.jit import FAST, SUMS, njit
@@ -26,20 +26,15 @@ LOST_BY_FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # o
 @njit(inline="always", **FAST)
 def _aim(v, i, surface, rays, exit_, frame, oblique, point, parallel):
     """Powers and landing points of row i."""
-    if parallel is not None:
+    if oblique is None:
         combine(i, surface, v[row.SAG], v[row.GX], v[row.GY])
-        beam.aim(v, i, rays, exit_, frame, parallel)
-    elif point is not None:
-        combine(i, surface, v[row.SAG], v[row.GX], v[row.GY])
-        pencil.aim(v, i, rays, exit_, frame, point)
-    elif oblique is None:
-        combine(i, surface, v[row.SAG], v[row.GX], v[row.GY])
+    if oblique is not None or point is not None or parallel is not None:
+        landing.aim(v, i, surface, rays, exit_, frame, oblique, point, parallel)
+    else:
         load(rays.flux[i], v[row.FLUX])
         load(rays.x[i], v[row.X])
         load(rays.y[i], v[row.Y])
         axial_refraction.aim(v, exit_, frame)
-    else:
-        oblique_refraction.aim(v, i, surface, rays, exit_, frame)
 
 
 @njit(**SUMS)
@@ -87,8 +82,8 @@ def forward(block, images, ledgers, scratch, surface, rays, exit_, frame, splat,
     images (blocks, n_x + 4 r_x, n_y + 4 r_y, and -v_y % 4 more), ledgers and scratch (blocks, `scratch_rows`, b) are overwritten;
     they set the number of blocks.
 
-    surface, rays, exit_, frame, splat: as in `arguments`.  oblique: True for rays of any direction; point: of rays from one, see
-    `pencil`; parallel: of parallel rays at an angle to z, see `beam`; all None for rays along z.  Each is compiled apart.
+    surface, rays, exit_, frame, splat: as in `arguments`.  oblique: True for rays of any direction; point: of rays from one;
+    parallel: of parallel rays at an angle to z; all None for rays along z.  Each is compiled apart.
     """
     if block == ALL:
         on_threads(len(images), (images, ledgers, scratch, surface, rays, exit_, frame, splat, oblique, point, parallel))
@@ -131,14 +126,11 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, surface, rays, exi
         _remove_lost(v[row.POWER])
         share(v, splat, sx, sy, dx, dy)
         gather(v, v.shape[1], frame, splat, sx, sy, dx, dy, grad, grad_leaving, grad_leaving, column, tilt)
-        if parallel is not None:
-            beam.pull(v, i, rays, exit_, parallel)
-            spread(i, surface, v[row.BY_SAG], v[row.BY_GX], v[row.BY_GY], nets[:, 0 if apart else block], apart)
-        elif point is not None:
-            pencil.pull(v, i, rays, exit_, point)
-            spread(i, surface, v[row.BY_SAG], v[row.BY_GX], v[row.BY_GY], nets[:, block], False)
-        elif oblique is None:
-            axial_refraction.pull(v, exit_)
-            spread(i, surface, v[row.BY_SAG], v[row.BY_GX], v[row.BY_GY], nets[:, 0 if apart else block], apart)
+        if oblique is not None:
+            landing.pull(v, i, surface, rays, exit_, oblique, point, parallel, nets[0, 0, i], nets[1, 0, i], nets[2, 0, i])
+            continue
+        if point is not None or parallel is not None:
+            landing.pull(v, i, surface, rays, exit_, oblique, point, parallel, v[row.BY_SAG], v[row.BY_GX], v[row.BY_GY])
         else:
-            oblique_refraction.pull(v, i, surface, rays, exit_, nets[:, 0])
+            axial_refraction.pull(v, exit_)
+        spread(i, surface, v[row.BY_SAG], v[row.BY_GX], v[row.BY_GY], nets[:, 0 if apart else block], apart)

@@ -18,7 +18,6 @@ from torch.autograd.function import once_differentiable
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks, fused, pixels, random_points
 from caustic_cli.optics.kernels.arguments import (
-    Components,
     Exit,
     ParallelLight,
     Point,
@@ -34,6 +33,7 @@ from caustic_cli.optics.kernels.ray_intersections import RayIntersections
 from caustic_cli.optics.kernels.splat import trimmed
 from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
 from caustic_cli.optics.kernels.threads import ALL
+from caustic_cli.optics.kernels.transfer import TargetPlane
 from caustic_cli.optics.receiver import Receiver, dot
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
@@ -124,27 +124,19 @@ class BeamKernel(PlaneKernel):
     def __init__(self, spaces, half_size, beam: Beam, entrance: tuple[float, str], like: BeamKernel | None = None):
         sample = beam.sample
         super().__init__(spaces, half_size, sample.u, sample.v, sample.tensor, sample.flux, like)
-        self.z_in, (self.kx, self.ky), self.half_size = beam.z_in, beam.inside(entrance[0]), beam.aperture.half_size
+        self.z_in, self.k, self.half_size = beam.z_in, beam.inside(entrance[0]), beam.aperture.half_size
         self.round, self.power = bool(beam.aperture.round), beam.irradiance * beam.transmittance(*entrance)
 
     def onto(self, sag: Tensor, eta: float, fresnel: str, reference: float, receiver: Receiver, filter: Filter):
         """Control heights (n, m) float64 relative to `reference`, mm: see `_splat`."""
-        light, frame = (None, self._light(receiver, reference, eta)), ScreenFrame.of(receiver.screen, receiver.low)
+        light, frame = (None, self._light(receiver, reference)), ScreenFrame.of(receiver.screen, receiver.low)
         ends = self.z_in - reference, 0.0
         return self._splatted(sag, (eta, fresnel), ends, receiver.screen, filter, light, frame)
 
-    def _light(self, receiver: Receiver, reference: float, eta: float) -> ParallelLight:
-        kx, ky = self.kx, self.ky
-        middle = (*receiver.middle[:2], receiver.middle[2] - reference)
-        along, up, (x, y, z) = receiver.axes
-        normal = (x, y, z) if eta * dot(receiver.axis, (x, y, z)) > 0 else (-x, -y, -z)
-        axes = along, up, normal
-        e1, e2, e3 = (Components(*map(float, axis)) for axis in axes)
-        c1, c2, c3 = (float(dot(middle, axis)) for axis in axes)
-        on1, on2, on3 = (float(dot((kx, ky, 1.0), axis)) for axis in axes)
-        over_x, over_y = (1.0 / r for r in self.half_size)
-        long2 = 1.0 + kx * kx + ky * ky
-        return ParallelLight(kx, ky, long2, self.power, over_x, over_y, self.round, e1, e2, e3, c1, c2, c3, on1, on2, on3)
+    def _light(self, receiver: Receiver, reference: float) -> ParallelLight:
+        (x, y, z), (rx, ry) = receiver.middle, self.half_size
+        plane = TargetPlane.of((x, y, z - reference), receiver.axes, 1.0 if dot(receiver.axis, receiver.axes[2]) > 0 else -1.0)
+        return ParallelLight(*self.k, self.power, 1.0 / rx, 1.0 / ry, self.round, plane)
 
 
 class RayKernel:
@@ -243,20 +235,12 @@ class PencilKernel:
     def __call__(self, sag: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
         """Control heights (n, m) float64 relative to `reference`, mm: see `_splat`."""
         steps = self.steps(float(sag.detach().max()) + reference - self.z_in)
-        point = Point(
-            float(self.place[0]),
-            float(self.place[1]),
-            float(self.distance),
-            float(self.index),
-            steps,
-            self.scale,
-            self.coefficients,
-        )
+        point = Point(float(self.distance), float(self.index), steps, self.scale, self.coefficients)
+        frame = ScreenFrame.of(screen, (screen.low[0] - self.place[0], screen.low[1] - self.place[1]))
         net, net_y = self.along_v(sag)
         ends = self.z_in - reference, screen.z - reference
-        return _splat(
-            (net, net, net_y), self.rows, False, self.rays, (eta, fresnel), ends, screen, filter, self.workspace, (point, None)
-        )
+        nets, light = (net, net, net_y), (point, None)
+        return _splat(nets, self.rows, False, self.rays, (eta, fresnel), ends, screen, filter, self.workspace, light, frame)
 
 
 #: Largest number of Newton steps, and the relative size of a step that is not taken, since the next would be its square.

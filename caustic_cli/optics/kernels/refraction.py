@@ -3,12 +3,13 @@
 Rays are float64 components, see `stage`; the reference is `interface` with `polarisation.s_fraction`.  For rays with d . N < 0 the
 normal is reversed.
 
-Notation, a ray with unit direction d, power P, and slopes g of the surface at its hit; N = (-g_x, -g_y, 1), eta = n_in / n_out
+Notation, a ray along d, power P, and slopes g of the surface at its hit; N = (-g_x, -g_y, 1), eta = n_in / n_out, -1 for a mirror
     sigma   1 where d . N >= 0, else -1;  sigma N is the normal along which light passes
     c       sigma (d . N) >= 0
-    s       sqrt(|N|^2 + eta^2 (c^2 - |N|^2)), the same product behind; 1, without derivatives, where light is totally reflected
-    gamma   sigma (1 - eta^2) / (s + eta c)
-    t       eta d + gamma N, the direction behind
+    s       sqrt(|N|^2 |d|^2 + eta^2 (c^2 - |N|^2 |d|^2)), the same product behind; 1, without derivatives, where light is totally
+            reflected
+    gamma   (1 - eta^2) |d|^2 / (s + eta c), or (s - eta c) / |N|^2, which is 2 c / |N|^2 for a mirror
+    t       eta d + sigma gamma N, the direction behind, as long as d; for a mirror it is the negative of this
     w, q    d x N and |w|^2;  a = E . w for the field's unit vector E
     f       a^2 / q, the s-polarised part; 1/2 in normal incidence and for light without polarisation
     R       f R_s + (1 - f) R_p with R_s = ((eta c - s) / (eta c + s))^2, R_p = ((c - eta s) / (c + eta s))^2 (exact), or
@@ -20,6 +21,7 @@ by_v is the derivative of whatever is differentiated by v.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from torch import Tensor
@@ -44,48 +46,47 @@ class Interface(NamedTuple):
 
 
 @njit(inline="always", **FAST)
-def _meet(dx, dy, dz, gx, gy, eta):
-    """|N|^2, c, sigma, s, and whether light passes."""
+def _meet(dx, dy, dz, long2, gx, gy, eta):
+    """|N|^2, c, sigma, s, whether light passes, |gamma|, and one over its denominator."""
     norm2, along = 1.0 + gx * gx + gy * gy, dz - dx * gx - dy * gy
     c = abs(along)
-    s, passes = cosine_behind(norm2, c, eta)
-    return norm2, c, 1.0 if along >= 0.0 else -1.0, s, passes
+    s, passes = cosine_behind(norm2 * long2, c, eta)
+    under = 1.0 / (norm2 if eta < 0.0 else s + eta * c)
+    gamma = (2.0 * c if eta < 0.0 else (1.0 - eta) * (1.0 + eta) * long2) * under
+    return norm2, c, math.copysign(1.0, along), s, passes, gamma, under
 
 
 @njit(inline="always", **FAST)
-def bend(dx, dy, dz, gx, gy, f, eta, fresnel):
-    """t, 1 - R and whether light passes, of one ray."""
-    norm2, c, side, s, passes = _meet(dx, dy, dz, gx, gy, eta)
-    r, _, _, _, _ = reflectance(fresnel, eta, norm2, c, s, f)
-    gamma = side * (1.0 - eta) * (1.0 + eta) / (s + eta * c)
-    return eta * dx - gamma * gx, eta * dy - gamma * gy, eta * dz + gamma, 1.0 - r, passes
+def bend(dx, dy, dz, long2, gx, gy, f, eta, fresnel):
+    """t, 1 - R and whether light passes, of one ray; long2: |d|^2."""
+    norm2, c, side, s, passes, gamma, _ = _meet(dx, dy, dz, long2, gx, gy, eta)
+    r, _, _, _, _ = reflectance(fresnel, eta, norm2 * long2, c, s, f)
+    n, gamma = abs(eta), math.copysign(1.0, eta) * side * gamma
+    return n * dx - gamma * gx, n * dy - gamma * gy, n * dz + gamma, 1.0 - r, passes
 
 
 @njit(inline="always", **FAST)
-def pull(dx, dy, dz, gx, gy, f, power, eta, fresnel, tx, ty, tz, by_after):
-    """Adjoint of `bend`: derivatives by d, g, P and f of one ray, from those by t and P'."""
-    norm2, c, side, s, passes = _meet(dx, dy, dz, gx, gy, eta)
-    r, r_c, r_s, r_norm2, r_f = reflectance(fresnel, eta, norm2, c, s, f)
+def pull(dx, dy, dz, long2, gx, gy, f, power, eta, fresnel, tx, ty, tz, by_after):
+    """Adjoint of `bend`: derivatives by d, g, P, f and |d|^2 of one ray, from those by t and P'."""
+    norm2, c, side, s, passes, gamma, under = _meet(dx, dy, dz, long2, gx, gy, eta)
+    r, r_c, r_s, r_both, r_f = reflectance(fresnel, eta, norm2 * long2, c, s, f)
     # P'
     by_after = by_after if passes else 0.0
     by_r = -power * by_after
-    # R
-    by_c, by_s, by_norm2 = by_r * r_c, by_r * r_s, by_r * r_norm2
     # t
-    under = 1.0 / (s + eta * c)
-    gamma = side * (1.0 - eta) * (1.0 + eta) * under
-    by_gamma = tz - gx * tx - gy * ty
-    # gamma
-    by_s -= gamma * by_gamma * under
-    by_c -= eta * gamma * by_gamma * under
-    # s
-    by_radicand = 0.5 * by_s / s if passes else 0.0
-    by_norm2 += by_radicand * (1.0 - eta) * (1.0 + eta)
-    by_c += by_radicand * 2.0 * eta * eta * c
+    n, toward = abs(eta), math.copysign(1.0, eta) * side
+    by_gamma = toward * (tz - gx * tx - gy * ty) * under
+    toward *= gamma
+    # gamma, R and s
+    bent = 0.0 if eta < 0.0 else by_gamma
+    by_radicand = 0.5 * (by_r * r_s - gamma * bent) / s if passes else 0.0
+    by_both = by_r * r_both + by_radicand * (1.0 - eta) * (1.0 + eta)
+    by_c = by_r * r_c + 2.0 * eta * eta * by_radicand * c + (2.0 * by_gamma if eta < 0.0 else -eta * gamma * by_gamma)
     # c and |N|^2
-    by_c *= side
-    by_gx, by_gy = 2.0 * gx * by_norm2 - by_c * dx - gamma * tx, 2.0 * gy * by_norm2 - by_c * dy - gamma * ty
-    return eta * tx - by_c * gx, eta * ty - by_c * gy, eta * tz + by_c, by_gx, by_gy, (1.0 - r) * by_after, by_r * r_f
+    by_along, by_norm2 = side * by_c, by_both * long2 - gamma * (by_gamma - bent)
+    by_gx, by_gy = 2.0 * gx * by_norm2 - by_along * dx - toward * tx, 2.0 * gy * by_norm2 - by_along * dy - toward * ty
+    by_dx, by_dy, by_dz = n * tx - by_along * gx, n * ty - by_along * gy, n * tz + by_along
+    return by_dx, by_dy, by_dz, by_gx, by_gy, (1.0 - r) * by_after, by_r * r_f, by_both * norm2 + (1.0 - eta) * (1.0 + eta) * bent
 
 
 @njit(inline="always", **FAST)
@@ -140,7 +141,8 @@ def _refract(v, start, count, ray, surface, _given, out):
     _load(ray, start, count, v)
     _part(v, count, surface.polarised)
     for j in range(count):
-        tx, ty, tz, kept, passing = bend(v[DX, j], v[DY, j], v[DZ, j], v[GX, j], v[GY, j], v[F, j], surface.eta, surface.fresnel)
+        d_x, d_y, d_z, g_x, g_y, f = v[DX, j], v[DY, j], v[DZ, j], v[GX, j], v[GY, j], v[F, j]
+        tx, ty, tz, kept, passing = bend(d_x, d_y, d_z, 1.0, g_x, g_y, f, surface.eta, surface.fresnel)
         v[TX, j], v[TY, j], v[TZ, j] = tx, ty, tz
         v[AFTER, j], v[PASSES, j] = v[P, j] * kept if passing else 0.0, 1.0 if passing else 0.0
     for i in range(4):
@@ -158,8 +160,8 @@ def _refract_adjoint(v, start, count, ray, surface, given, out):
     _part(v, count, surface.polarised)
     for j in range(count):
         d_x, d_y, d_z, g_x, g_y, f, power = v[DX, j], v[DY, j], v[DZ, j], v[GX, j], v[GY, j], v[F, j], v[P, j]
-        by_dx, by_dy, by_dz, by_gx, by_gy, by_p, by_f = pull(
-            d_x, d_y, d_z, g_x, g_y, f, power, eta, fresnel, v[TX, j], v[TY, j], v[TZ, j], v[AFTER, j]
+        by_dx, by_dy, by_dz, by_gx, by_gy, by_p, by_f, _ = pull(
+            d_x, d_y, d_z, 1.0, g_x, g_y, f, power, eta, fresnel, v[TX, j], v[TY, j], v[TZ, j], v[AFTER, j]
         )
         v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j], v[BY_GX, j], v[BY_GY, j] = by_dx, by_dy, by_dz, by_gx, by_gy
         v[BY_P, j], v[BY_F, j] = by_p, by_f

@@ -3,7 +3,7 @@
 Rays are float64 components, see `stage`; the reference is `backends.reference`.
 
 Notation, a ray from o in direction d, a plane through p with unit vectors a (along), b (up) and n (normal)
-    v       d . n; the ray reaches the plane where forward v > PARALLEL, forward being 1, or -1 for light returned by a mirror
+    v       d . n; the ray reaches the plane where v > PARALLEL
     k       (p - o) . n / v, length of the path; the ray is on its way where it arrives and k > 0, and k is 0 where it is not
     r       (o - p) + k d
     x, y    r . a and r . b
@@ -25,7 +25,7 @@ Vector = tuple[float, float, float]
 
 
 class TargetPlane(NamedTuple):
-    """The target plane: p, a, b and n by components, and `forward`."""
+    """The target plane: p, a, b and n by components."""
 
     px: float
     py: float
@@ -39,16 +39,24 @@ class TargetPlane(NamedTuple):
     nx: float
     ny: float
     nz: float
-    forward: float
+
+    @classmethod
+    def of(cls, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float = 1.0) -> TargetPlane:
+        """By a point, unit vectors along its x and y, and its normal; forward: -1 for light that arrives against this."""
+        along, up, (x, y, z) = axes
+        return cls._make([float(c) for vector in (point, along, up, (forward * x, forward * y, forward * z)) for c in vector])
 
 
 @njit(inline="always", **FAST)
 def _path(ox, oy, oz, dx, dy, dz, plane):
     """k, 1 / v, and whether the ray is on its way."""
     nx, ny, nz = plane.nx, plane.ny, plane.nz
-    speed = dx * nx + dy * ny + dz * nz
-    away = (plane.px - ox) * nx + (plane.py - oy) * ny + (plane.pz - oz) * nz
-    arrives = plane.forward * speed > PARALLEL
+    return _length((plane.px - ox) * nx + (plane.py - oy) * ny + (plane.pz - oz) * nz, dx * nx + dy * ny + dz * nz)
+
+
+@njit(inline="always", **FAST)
+def _length(away, speed):
+    arrives = speed > PARALLEL
     over = 1.0 / (speed if arrives else 1.0)
     k = away * over
     on_way = arrives & (k > 0.0)
@@ -75,6 +83,24 @@ def pull(ox, oy, oz, dx, dy, dz, plane, x, y):
     by_away = by_k * over if on_way else 0.0
     by_ox, by_oy, by_oz = rx - by_away * plane.nx, ry - by_away * plane.ny, rz - by_away * plane.nz
     return by_ox, by_oy, by_oz, k * by_ox, k * by_oy, k * by_oz
+
+
+# Of an upright screen at a height: products with its plane's zeros and ones would take time, since the compiler must keep them.
+
+
+@njit(inline="always", **FAST)
+def arrive_upright(ox, oy, oz, dx, dy, dz, height):
+    """`arrive`."""
+    k, _, on_way = _length(height - oz, dz)
+    return ox + k * dx, oy + k * dy, on_way
+
+
+@njit(inline="always", **FAST)
+def pull_upright(ox, oy, oz, dx, dy, dz, height, x, y):
+    """Adjoint of `arrive_upright`; its derivatives by o_x and o_y are those by x and y."""
+    k, over, on_way = _length(height - oz, dz)
+    by_oz = -(x * dx + y * dy) * over if on_way else 0.0
+    return x, y, by_oz, k * x, k * y, k * by_oz
 
 
 @njit(inline="always", **FAST)
@@ -122,5 +148,4 @@ def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], 
         x, y: (N,) in the plane; of rays that are not on their way to it those of their origin, and meaningless.
         on_way: (N,) bool.
     """
-    plane = TargetPlane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
-    return LAND(plane, *origin, *direction)
+    return LAND(TargetPlane.of(point, axes, forward), *origin, *direction)
