@@ -283,8 +283,7 @@ def test_compilation_is_spoken_of_where_something_is_compiled(monkeypatch):
 
 @njit(entry=True)
 def _numbered(k, pair, factor, refused):
-    if k == ALL:
-        on_threads(len(pair[0]), (pair, factor, refused))
+    if on_threads(k, len(pair[0]), (pair, factor, refused)):
         return
     if k == refused:
         raise MemoryError

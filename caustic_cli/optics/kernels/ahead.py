@@ -52,7 +52,7 @@ def _refraction() -> None:
 
     one, space = torch.ones(1, dtype=torch.float64), SplineSpace.uniform(6, 3)
     interact((0.0, 0.0, 1.0), (0.0 * one, 0.0 * one), one, eta=1.5, fresnel="exact")
-    FusedSurface((space, space), (1.0, 1.0)).evaluate(torch.zeros(6, 6), np.ones(1), np.ones(1))
+    FusedSurface((space, space), (1.0, 1.0)).evaluate(np.zeros((6, 6)), np.ones(1), np.ones(1))
 
 
 def _fields() -> None:

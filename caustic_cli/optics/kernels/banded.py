@@ -6,13 +6,13 @@ A dense product takes as many operations as there are control points along v; on
 
 from __future__ import annotations
 
-import torch
+import numpy as np
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.stage import Stage
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
@@ -26,33 +26,13 @@ class AlongV:
 
     def __call__(self, net: Tensor) -> tuple[Tensor, Tensor]:
         """Net (n, m) float64 -> the spline's values and scaled derivatives along v at every point: (n, b) each, differentiable."""
-        blocks()
-        return _Contraction.apply(net, self)
-
-
-class _Contraction(torch.autograd.Function):
-    @staticmethod
-    def forward(net: Tensor, along: AlongV):
-        out = [torch.empty(len(net), len(along.arrays[0]), dtype=torch.float64) for _ in range(2)]
-        _contract(ALL, net.detach().contiguous().numpy(), *along.arrays, *(t.numpy() for t in out))
-        return tuple(out)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.along = inputs[1]
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, by_value, by_slope):
-        out = torch.zeros(len(by_value), ctx.along.size, dtype=torch.float64)
-        _spread(ALL, by_value.contiguous().numpy(), by_slope.contiguous().numpy(), *ctx.along.arrays, out.numpy())
-        return out, None
+        value, slope = _CONTRACTION(self, net)
+        return value, slope
 
 
 @njit(entry=True, **FAST)
 def _contract(i, net, first, values, slopes, out, out_slope):
-    if i == ALL:
-        on_threads(len(net), (net, first, values, slopes, out, out_slope))
+    if on_threads(i, len(net), (net, first, values, slopes, out, out_slope)):
         return
     row, to, to_slope = net[i], out[i], out_slope[i]
     for j in range(len(first)):
@@ -65,11 +45,27 @@ def _contract(i, net, first, values, slopes, out, out_slope):
 
 @njit(entry=True, **FAST)
 def _spread(i, by_value, by_slope, first, values, slopes, out):
-    if i == ALL:
-        on_threads(len(out), (by_value, by_slope, first, values, slopes, out))
+    if on_threads(i, len(out), (by_value, by_slope, first, values, slopes, out)):
         return
     to, value, slope = out[i], by_value[i], by_slope[i]
     for j in range(len(first)):
         at = first[j]
         for k in range(values.shape[1]):
             to[at + k] += values[j, k] * value[j] + slopes[j, k] * slope[j]
+
+
+def _forward(along: AlongV, net):
+    out = [np.empty((len(net), len(along.arrays[0]))) for _ in range(2)]
+    blocks()
+    _contract(ALL, net, *along.arrays, *out)
+    return out
+
+
+def _adjoint(along: AlongV, _inputs, _kept, by, _wanted):
+    out = np.zeros((len(by[0]), along.size))
+    blocks()
+    _spread(ALL, *by, *along.arrays, out)
+    return (out,)
+
+
+_CONTRACTION = Stage(_forward, _adjoint, 2)

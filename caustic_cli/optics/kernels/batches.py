@@ -44,8 +44,8 @@ from numba.extending import intrinsic
 
 from caustic_cli.optics.kernels.intersect import HIT, MISSED, _leaves, _root, value_at
 from caustic_cli.optics.kernels.jit import FAST, SUMS, njit
-from caustic_cli.optics.kernels.spline import curvatures, piece, place, push_powers
-from caustic_cli.optics.kernels.threads import ALL, on_threads
+from caustic_cli.optics.kernels.spline import jet, piece, place, push_powers
+from caustic_cli.optics.kernels.threads import on_threads
 from caustic_cli.optics.tolerances import FEW_ULP, LEAST_COSINE
 
 #: Rays of a batch: enough to fill the vectors several times over, few enough for sums over them to stay in registers.
@@ -72,8 +72,8 @@ OU, OV, OZ, DU, DV, DZ, T, XI, ETA, ROW, SLOPE, HALF, Z, Z_XI, Z_ETA, H_XI, MIXE
 )
 GX, GY, BY_T, BY_U, BY_V, BY_Z, BY_X, BY_Y = range(22 * LANES, 30 * LANES, LANES)
 ROWS = 30
-# Sizes of the scratch of Horner's scheme, for value and slopes, and for second derivatives; and of powers.
-JET, BEND, POWERS = 7 * LANES, 11 * LANES, 6 * LANES
+# Sizes of the scratch of Horner's scheme and of powers.
+JET, POWERS = 11 * LANES, 6 * LANES
 
 
 @intrinsic
@@ -139,37 +139,11 @@ def _bounds(c, i, j):
 
 
 @njit(**FAST)
-def _jets(w, c, i, j):
-    """`spline.jet` in all lanes, from XI and ETA to Z, Z_XI and Z_ETA."""
+def _jets(w, c, i, j, curved):
+    """`spline.jet` in all lanes, from XI and ETA to Z, Z_XI and Z_ETA, or unless `curved` is None to H_XI, MIXED and H_ETA, the
+    first and last of which are halves."""
     p, q = c.shape[2], c.shape[3]
     s = carray(_stack(JET), (JET,))
-    for k in range(LANES):
-        s[k], s[LANES + k] = w[XI + k], w[ETA + k]
-        s[4 * LANES + k], s[5 * LANES + k], s[6 * LANES + k] = 0.0, 0.0, 0.0
-    for a in range(p - 1, -1, -1):
-        top = c[i, j, a, q - 1]
-        for k in range(LANES):
-            s[2 * LANES + k], s[3 * LANES + k] = top, 0.0
-        for b in range(q - 2, -1, -1):
-            one = c[i, j, a, b]
-            for k in range(LANES):
-                eta, row = s[LANES + k], s[2 * LANES + k]
-                s[3 * LANES + k] = s[3 * LANES + k] * eta + row
-                s[2 * LANES + k] = row * eta + one
-        for k in range(LANES):
-            xi, z = s[k], s[4 * LANES + k]
-            s[5 * LANES + k] = s[5 * LANES + k] * xi + z
-            s[4 * LANES + k] = z * xi + s[2 * LANES + k]
-            s[6 * LANES + k] = s[6 * LANES + k] * xi + s[3 * LANES + k]
-    for k in range(LANES):
-        w[Z + k], w[Z_XI + k], w[Z_ETA + k] = s[4 * LANES + k], s[5 * LANES + k], s[6 * LANES + k]
-
-
-@njit(**FAST)
-def _curvatures(w, c, i, j):
-    """`spline.curvatures` in all lanes, from XI and ETA to H_XI, MIXED and H_ETA; the first and last are halves."""
-    p, q = c.shape[2], c.shape[3]
-    s = carray(_stack(BEND), (BEND,))
     for k in range(LANES):
         s[k], s[LANES + k] = w[XI + k], w[ETA + k]
         s[5 * LANES + k], s[6 * LANES + k], s[7 * LANES + k] = 0.0, 0.0, 0.0
@@ -182,19 +156,24 @@ def _curvatures(w, c, i, j):
             one = c[i, j, a, b]
             for k in range(LANES):
                 eta, row, slope = s[LANES + k], s[2 * LANES + k], s[3 * LANES + k]
-                s[4 * LANES + k] = s[4 * LANES + k] * eta + slope
+                if curved is not None:
+                    s[4 * LANES + k] = s[4 * LANES + k] * eta + slope
                 s[3 * LANES + k] = slope * eta + row
                 s[2 * LANES + k] = row * eta + one
         for k in range(LANES):
             xi, z, z_xi, z_eta = s[k], s[5 * LANES + k], s[6 * LANES + k], s[8 * LANES + k]
-            s[7 * LANES + k] = s[7 * LANES + k] * xi + z_xi
+            if curved is not None:
+                s[7 * LANES + k] = s[7 * LANES + k] * xi + z_xi
+                s[9 * LANES + k] = s[9 * LANES + k] * xi + z_eta
+                s[10 * LANES + k] = s[10 * LANES + k] * xi + s[4 * LANES + k]
             s[6 * LANES + k] = z_xi * xi + z
             s[5 * LANES + k] = z * xi + s[2 * LANES + k]
-            s[9 * LANES + k] = s[9 * LANES + k] * xi + z_eta
             s[8 * LANES + k] = z_eta * xi + s[3 * LANES + k]
-            s[10 * LANES + k] = s[10 * LANES + k] * xi + s[4 * LANES + k]
     for k in range(LANES):
-        w[H_XI + k], w[MIXED + k], w[H_ETA + k] = s[7 * LANES + k], s[9 * LANES + k], s[10 * LANES + k]
+        if curved is None:
+            w[Z + k], w[Z_XI + k], w[Z_ETA + k] = s[5 * LANES + k], s[6 * LANES + k], s[8 * LANES + k]
+        else:
+            w[H_XI + k], w[MIXED + k], w[H_ETA + k] = s[7 * LANES + k], s[9 * LANES + k], s[10 * LANES + k]
 
 
 @njit(**FAST)
@@ -224,7 +203,7 @@ def _settle(w, size, c, i, j, bounds, pieces):
             xi, eta = (w[OU + k] + t * w[DU + k] - mi) * wi, (w[OV + k] + t * w[DV + k] - mj) * wj
             w[BUSY + k] = w[BUSY + k] if max(abs(xi), abs(eta)) <= 0.5 + BEYOND else 0.0
             w[XI + k], w[ETA + k] = xi, eta
-        _jets(w, c, i, j)
+        _jets(w, c, i, j, None)
         left = 0
         for k in range(LANES):
             t, du, dv, dz, busy = w[T + k], w[DU + k], w[DV + k], w[DZ + k], w[BUSY + k] > 0.0
@@ -293,28 +272,6 @@ def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, pieces):
         t -= (oz + t * dz - z) / max(slope, 0.5 * dz)
     t = min(max(t, 0.0), most)
     return t, piece(ou + t * du, pieces.breaks_u), piece(ov + t * dv, pieces.breaks_v)
-
-
-@njit(inline="always", **FAST)
-def first_hit(ray, limits, slopes, c, pieces):
-    """First intersection of one ray, without a circular aperture: status, span product (-1: none), reach, dz/dx, dz/dy."""
-    ou, ov, oz, du, dv, dz = ray
-    slope = slopes[0] * abs(du) + slopes[1] * abs(dv)
-    t, status = _root((ou, ov, oz, du, dv, dz), -1.0, limits, slope, c, pieces)
-    where, reach, gx, gy = -1, -1.0, 0.0, 0.0
-    if status == HIT:
-        u, v = ou + t * du, ov + t * dv
-        _, zu, zv = value_at(c, u, v, pieces)
-        where = piece(u, pieces.breaks_u) * (len(pieces.breaks_v) - 1) + piece(v, pieces.breaks_v)
-        reach, gx, gy = t, zu * pieces.scale_x, zv * pieces.scale_y
-    return status, where, reach, gx, gy
-
-
-@njit(inline="always", **FAST)
-def beyond(ou, ov, du, dv, reach, round_, pieces):
-    """Whether an intersection is farther from the axis than `round_`, mm."""
-    x, y = (ou - 0.5 + reach * du) / pieces.scale_x, (ov - 0.5 + reach * dv) / pieces.scale_y
-    return x * x + y * y > round_ * round_
 
 
 class _Tile(NamedTuple):
@@ -402,13 +359,17 @@ def _turn(left, lone, to, fewest, rays, size, c, pieces, tile, hits):
 
 @njit(**FAST)
 def _one_by_one(lone, to, rays, limits, slopes, c, pieces, alone, hits):
-    ou, ov, oz, du, dv, dz = rays
+    (ou, ov, oz, du, dv, dz), (status, reach, gx, gy, met, where) = rays, hits
     for k in range(lone):
         r = alone[k]
-        hits.met[to] = r
-        hits.status[r], hits.where[to], hits.reach[r], hits.gx[r], hits.gy[r] = first_hit(
-            (ou[r], ov[r], oz[r], du[r], dv[r], dz[r]), limits, slopes, c, pieces
-        )
+        slope = slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r])
+        t, status[r] = _root((ou[r], ov[r], oz[r], du[r], dv[r], dz[r]), -1.0, limits, slope, c, pieces)
+        met[to], where[to], reach[r], gx[r], gy[r] = r, -1, -1.0, 0.0, 0.0
+        if status[r] == HIT:
+            u, v = ou[r] + t * du[r], ov[r] + t * dv[r]
+            _, zu, zv = value_at(c, u, v, pieces)
+            where[to] = piece(u, pieces.breaks_u) * (len(pieces.breaks_v) - 1) + piece(v, pieces.breaks_v)
+            reach[r], gx[r], gy[r] = t, zu * pieces.scale_x, zv * pieces.scale_y
         to += 1
 
 
@@ -419,8 +380,7 @@ def first_hits(block, order, batched, rays, limits, slopes, round_, c, pieces, h
     order (N,): of the rays; batched: whether to look for batches; limits: least and largest control height; slopes: bounds of
     |Z_u| and |Z_v|; round_: radius of a circular aperture, mm, or infinite.
     """
-    if block == ALL:
-        on_threads(blocks, (order, batched, rays, limits, slopes, round_, c, pieces, hits, blocks))
+    if on_threads(block, blocks, (order, batched, rays, limits, slopes, round_, c, pieces, hits, blocks)):
         return
     count, size, fewest = len(order), max(abs(limits[0]), abs(limits[1])), max(1, FEWEST // (c.shape[2] * c.shape[3]))
     some, together, alone = np.empty(TILE, np.int32), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
@@ -443,7 +403,8 @@ def first_hits(block, order, batched, rays, limits, slopes, round_, c, pieces, h
             (ou, ov, _, du, dv, _), (status, reach, gx, gy, met, where) = rays, hits
             for k in range(first, last):
                 r = met[k]
-                if status[r] == HIT and beyond(ou[r], ov[r], du[r], dv[r], reach[r], round_, pieces):
+                x, y = (ou[r] - 0.5 + reach[r] * du[r]) / pieces.scale_x, (ov[r] - 0.5 + reach[r] * dv[r]) / pieces.scale_y
+                if status[r] == HIT and x * x + y * y > round_ * round_:
                     where[k], status[r], reach[r], gx[r], gy[r] = -1, MISSED, -1.0, 0.0, 0.0
         first = last
 
@@ -527,34 +488,20 @@ def _gather(table, p, q, total):
             total[a + 1, b + 3] += s7
 
 
-@njit(inline="always", **FAST)
-def pull_alone(c, i, j, xi, eta, by_t, by_u, by_v, direction, gx, gy, pieces):
-    """X, Y and L_Z of one ray in (u, v, z)-space; by_u, by_v: derivatives by Z_u and Z_v."""
-    (du, dv, dz), wi, wj = direction, pieces.over_u[i], pieces.over_v[j]
-    xx, xy, yy = curvatures(c, i, j, xi, eta)
-    xx, xy, yy = xx * wi * wi, xy * wi * wj, yy * wj * wj
-    by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
-    cosine = max(dz - gx * du / pieces.scale_x - gy * dv / pieces.scale_y, LEAST_COSINE)
-    return by_x, by_y, (by_t + by_x * du + by_y * dv) / cosine
-
-
 @njit(**FAST)
 def _pull_each(begin, end, a, b, met, by, rays, found, c, pieces, grad, powers, starts):
     """The adjoint of some rays that meet the span product (a, b), one by one."""
     (by_t, by_gx, by_gy), (ou, ov, _, du, dv, dz), (t, gx, gy), (by_ox, by_oy, by_oz) = by, rays, found, starts
-    wi, wj, mi, mj, scale_x, scale_y = (
-        pieces.over_u[a],
-        pieces.over_v[b],
-        pieces.middle_u[a],
-        pieces.middle_v[b],
-        pieces.scale_x,
-        pieces.scale_y,
-    )
+    _, mu, wu, _, mv, wv, scale_x, scale_y = pieces
+    wi, wj, mi, mj = wu[a], wv[b], mu[a], mv[b]
     for k in range(begin, end):
         r = met[k]
         xi, eta = (ou[r] + t[r] * du[r] - mi) * wi, (ov[r] + t[r] * dv[r] - mj) * wj
+        _, _, _, xx, xy, yy = jet(c, a, b, xi, eta)
         by_u, by_v = by_gx[r] * scale_x, by_gy[r] * scale_y
-        by_x, by_y, by_z = pull_alone(c, a, b, xi, eta, by_t[r], by_u, by_v, (du[r], dv[r], dz[r]), gx[r], gy[r], pieces)
+        by_x, by_y = by_u * xx * wi * wi + by_v * xy * wi * wj, by_u * xy * wi * wj + by_v * yy * wj * wj
+        cosine = max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
+        by_z = (by_t[r] + by_x * du[r] + by_y * dv[r]) / cosine
         if grad.size > 0:
             push_powers(grad, a, b, xi, eta, by_z, by_u * wi, by_v * wj, powers)
         if len(by_ox) > 0:
@@ -575,7 +522,7 @@ def _pull_lanes(begin, end, a, b, met, by, rays, found, c, pieces, w, starts):
     for k in range(LANES):
         w[XI + k] = (w[OU + k] + w[T + k] * w[DU + k] - mi) * wi
         w[ETA + k] = (w[OV + k] + w[T + k] * w[DV + k] - mj) * wj
-    _curvatures(w, c, a, b)
+    _jets(w, c, a, b, True)
     for k in range(LANES):
         xx, xy, yy = 2.0 * w[H_XI + k] * wi * wi, w[MIXED + k] * wi * wj, 2.0 * w[H_ETA + k] * wj * wj
         by_u, by_v = w[BY_U + k] * scale_x, w[BY_V + k] * scale_y
@@ -598,8 +545,7 @@ def pull_back(block, met, where, by, rays, found, c, pieces, grads, starts):
     coefficients, and `starts` (by o, (N,) each, per mm) no rays, if these are not asked for.
     """
     count, blocks, p, q, wide = len(where), len(grads), c.shape[2], c.shape[3], len(pieces.breaks_v) - 1
-    if block == ALL:
-        on_threads(blocks, (met, where, by, rays, found, c, pieces, grads, starts))
+    if on_threads(block, blocks, (met, where, by, rays, found, c, pieces, grads, starts)):
         return
     w, grad, powers = np.zeros(ROWS * LANES), grads[block], np.empty((2, q))
     grad[:] = 0.0

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.threads import ALL, on_threads
+from caustic_cli.optics.kernels.threads import on_threads
 
 #: Cells along a side of a block.
 COARSE = 8
@@ -56,8 +56,9 @@ def envelope(block, x, y, radius, top, segments, starts, least, least_of_blocks,
     and of the next; least: (I, J), lowest centre of each, inf where there is none; least_of_blocks: the same of COARSE x COARSE
     cells.
     """
-    if block == ALL:
-        on_threads(blocks, (x, y, radius, top, segments, starts, least, least_of_blocks, side, low_x, low_y, z, cx, cy, blocks))
+    if on_threads(
+        block, blocks, (x, y, radius, top, segments, starts, least, least_of_blocks, side, low_x, low_y, z, cx, cy, blocks)
+    ):
         return
     count, cells_x, cells_y = len(x), least.shape[0], least.shape[1]
     square, wide = radius * radius, COARSE * side

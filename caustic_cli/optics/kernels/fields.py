@@ -55,8 +55,7 @@ def _turn(x):
 @njit(entry=True, **FAST)
 def make_field(block, phase, factor, moved, amplitude, out, blocks):
     """amplitude exp(i (phase + factor moved)), (n, m) -> out (N, 2 M), whose other rows and columns are left as they are."""
-    if block == ALL:
-        on_threads(blocks, (phase, factor, moved, amplitude, out, blocks))
+    if on_threads(block, blocks, (phase, factor, moved, amplitude, out, blocks)):
         return
     n, m = phase.shape
     for k in range(block * n // blocks, (block + 1) * n // blocks):
@@ -70,8 +69,7 @@ def make_field(block, phase, factor, moved, amplitude, out, blocks):
 @njit(entry=True, **FAST)
 def make_pull(block, back, phase, factor, moved, amplitude, out, blocks):
     """Add the derivative by `moved` to out (n, m): 2 factor amplitude Im(back exp(-i (phase + factor moved))), back (N, 2 M)."""
-    if block == ALL:
-        on_threads(blocks, (back, phase, factor, moved, amplitude, out, blocks))
+    if on_threads(block, blocks, (back, phase, factor, moved, amplitude, out, blocks)):
         return
     n, m = phase.shape
     twice = np.float32(2.0) * factor
@@ -91,8 +89,7 @@ def _overlap(sample, edges, pixel):
 @njit(entry=True, **FAST)
 def on_pixels(block, field, rows, columns, out, blocks):
     """Power |field|^2 of samples (N, 2 M) on pixels, out (a, b) float64; rows (a + 1,), columns (b + 1,): their edges."""
-    if block == ALL:
-        on_threads(blocks, (field, rows, columns, out, blocks))
+    if on_threads(block, blocks, (field, rows, columns, out, blocks)):
         return
     a, b, wide = len(rows) - 1, len(columns) - 1, field.shape[1]
     squares = np.empty(wide, np.float32)
@@ -112,8 +109,7 @@ def on_pixels(block, field, rows, columns, out, blocks):
 @njit(entry=True, **FAST)
 def widen(block, by_pixel, columns, out, blocks):
     """Derivatives by pixels (a, b) -> by the squares of samples along y, out (a, 2 M), overwritten."""
-    if block == ALL:
-        on_threads(blocks, (by_pixel, columns, out, blocks))
+    if on_threads(block, blocks, (by_pixel, columns, out, blocks)):
         return
     a, b = by_pixel.shape
     for p in range(block * a // blocks, (block + 1) * a // blocks):
@@ -128,8 +124,7 @@ def widen(block, by_pixel, columns, out, blocks):
 @njit(entry=True, **FAST)
 def weigh(block, field, widened, rows, blocks):
     """Multiply samples (N, 2 M) by derivatives of pixels (a, 2 M), see `widen`."""
-    if block == ALL:
-        on_threads(blocks, (field, widened, rows, blocks))
+    if on_threads(block, blocks, (field, widened, rows, blocks)):
         return
     n, wide = field.shape
     mixed = np.empty(wide, np.float32)
@@ -152,8 +147,7 @@ def displace(block, u, v, c, pu, pv, pieces, weight, out, blocks):
 
     c: coefficients as of `spline`, (I, J, (p + 1) (q + 1)); pu, pv: tuples of p + 1 and q + 1 numbers, of known lengths.
     """
-    if block == ALL:
-        on_threads(blocks, (u, v, c, pu, pv, pieces, weight, out, blocks))
+    if on_threads(block, blocks, (u, v, c, pu, pv, pieces, weight, out, blocks)):
         return
     n, m = u.shape
     for k in range(block * n // blocks, (block + 1) * n // blocks):
@@ -171,8 +165,7 @@ def displace(block, u, v, c, pu, pv, pieces, weight, out, blocks):
 @njit(entry=True, **FAST)
 def pull_displacement(block, u, v, by, pu, pv, pieces, weight, grads):
     """Adjoint of `displace`: derivatives by the coefficients into grads (blocks, I, J, (p + 1) (q + 1)), overwritten."""
-    if block == ALL:
-        on_threads(len(grads), (u, v, by, pu, pv, pieces, weight, grads))
+    if on_threads(block, len(grads), (u, v, by, pu, pv, pieces, weight, grads)):
         return
     (n, m), blocks, grad = u.shape, len(grads), grads[block]
     grad[:] = 0.0
@@ -191,8 +184,7 @@ def pull_displacement(block, u, v, by, pu, pv, pieces, weight, grads):
 @njit(entry=True, **FAST)
 def reduce_phase(block, path, turns, across, along, out, blocks):
     """2 pi frac(turns path + across + along) -> out (n, m) float32: path (n, m), mm, ramps of both axes, in turns."""
-    if block == ALL:
-        on_threads(blocks, (path, turns, across, along, out, blocks))
+    if on_threads(block, blocks, (path, turns, across, along, out, blocks)):
         return
     n, m = path.shape
     for k in range(block * n // blocks, (block + 1) * n // blocks):
@@ -275,7 +267,7 @@ class FusedPathChange(PathChange):
         """As the reference."""
         grads = self.spline.workspace()
         pull_displacement(ALL, *self.points, by.numpy(), *self.orders, self.spline.pieces, self.weight, self._flat(grads))
-        return self.spline.pull(grads)
+        return torch.from_numpy(self.spline.pull(grads))
 
     @staticmethod
     def _flat(c: np.ndarray) -> np.ndarray:

@@ -14,12 +14,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.stage import Stage
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 #: Most basis functions that do not vanish at a point, along one axis: the scratch memory has (3, WIDE) numbers for each of three.
@@ -51,8 +50,7 @@ def _forward(index):
     @njit(entry=True, **FAST)
     def flow(block, c, medium, ray, time, weights, steps, out, blocks):
         """q, p, S and L (8, N), from ray: q and p, six components."""
-        if block == ALL:
-            on_threads(blocks, (c, medium, ray, time, weights, steps, out, blocks))
+        if on_threads(block, blocks, (c, medium, ray, time, weights, steps, out, blocks)):
             return
         count = len(time)
         some(block * count // blocks, (block + 1) * count // blocks, c, medium, ray, time, weights, steps, out)
@@ -93,8 +91,7 @@ def _backward(adjoint):
     def flow_adjoint(block, c, medium, ends, time, weights, steps, by, out, by_c):
         """Derivatives by q, p and time into out (7, N), by c into by_c (blocks, ...), from those by q, p, S and L."""
         count, blocks = len(time), len(by_c)
-        if block == ALL:
-            on_threads(blocks, (c, medium, ends, time, weights, steps, by, out, by_c))
+        if on_threads(block, blocks, (c, medium, ends, time, weights, steps, by, out, by_c)):
             return
         begin, end = block * count // blocks, (block + 1) * count // blocks
         some(begin, end, c, medium, ends, time, weights, steps, by, out, by_c[block])
@@ -118,32 +115,20 @@ class IndexFlow(NamedTuple):
 
         Differentiable once, in reverse mode, by coefficients, rays and time.
         """
-        return _Flow.apply(self, medium, np.array(weights), steps, coefficients, time, *ray)
+        return _FLOW((self, medium, np.array(weights), steps), coefficients, time, *ray)
 
 
-class _Flow(torch.autograd.Function):
-    @staticmethod
-    def forward(flow: IndexFlow, medium: tuple, weights, steps, coefficients, time, *ray):
-        out, c, rays = np.empty((8, len(time))), _array(coefficients), np.stack([_array(v) for v in ray])
-        flow.forward(ALL, c, medium, rays, _array(time), weights, steps, out, blocks())
-        return tuple(torch.from_numpy(row) for row in out)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.flow, ctx.medium, ctx.weights, ctx.steps, coefficients, time, *_ = inputs
-        ctx.save_for_backward(coefficients, time, *output[:6])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *by):
-        coefficients, time, *ends = ctx.saved_tensors
-        out, free = np.empty((7, len(time))), ctx.needs_input_grad[4]
-        by_c = np.zeros((blocks(), *(n if free else 0 for n in coefficients.shape)))
-        ends, by = (np.stack([_array(v) for v in values]) for values in (ends, by))
-        ctx.flow.backward(ALL, _array(coefficients), ctx.medium, ends, _array(time), ctx.weights, ctx.steps, by, out, by_c)
-        *rays, by_time = (torch.from_numpy(row) for row in out)
-        return None, None, None, None, torch.from_numpy(by_c.sum(0)) if free else None, by_time, *rays
+def _flow(parameters: tuple[IndexFlow, tuple, np.ndarray, int], coefficients, time, *ray):
+    (flow, medium, weights, steps), out = parameters, np.empty((8, len(time)))
+    flow.forward(ALL, coefficients, medium, np.stack(ray), time, weights, steps, out, blocks())
+    return tuple(out)
 
 
-def _array(value: Tensor) -> np.ndarray:
-    return value.detach().contiguous().numpy()
+def _flow_adjoint(parameters: tuple[IndexFlow, tuple, np.ndarray, int], inputs, kept, by, wanted):
+    (flow, medium, weights, steps), (coefficients, time, *_) = parameters, inputs
+    out, by_c = np.empty((7, len(time))), np.zeros((blocks(), *(n if wanted[0] else 0 for n in coefficients.shape)))
+    flow.backward(ALL, coefficients, medium, np.stack(kept[:6]), time, weights, steps, np.stack(by), out, by_c)
+    return by_c.sum(0), out[6], *out[:6]
+
+
+_FLOW = Stage(_flow, _flow_adjoint, 8, keeps=True)

@@ -85,8 +85,7 @@ def forward(block, images, ledgers, scratch, surface, rays, exit_, frame, splat,
     surface, rays, exit_, frame, splat: as in `arguments`.  oblique: True for rays of any direction; point: of rays from one;
     parallel: of parallel rays at an angle to z; all None for rays along z.  Each is compiled apart.
     """
-    if block == ALL:
-        on_threads(len(images), (images, ledgers, scratch, surface, rays, exit_, frame, splat, oblique, point, parallel))
+    if on_threads(block, len(images), (images, ledgers, scratch, surface, rays, exit_, frame, splat, oblique, point, parallel)):
         return
     rows, blocks = len(rays.x), len(images)
     images[block] = 0.0
@@ -109,12 +108,13 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, surface, rays, exi
     apart: no two rows share a row of the nets, so that a single sum suffices for all blocks.  Otherwise net_x is taken to be net
     itself, and the sum of both derivatives comes as the first.  scratch: overwritten, as in `forward`.
     """
-    if block == ALL:
-        if apart and oblique is None:
-            nets[:] = 0.0
-        on_threads(
-            len(scratch), (grad, grad_leaving, apart, nets, scratch, surface, rays, exit_, frame, splat, oblique, point, parallel)
-        )
+    if block == ALL and apart and oblique is None:
+        nets[:] = 0.0
+    if on_threads(
+        block,
+        len(scratch),
+        (grad, grad_leaving, apart, nets, scratch, surface, rays, exit_, frame, splat, oblique, point, parallel),
+    ):
         return
     rows, blocks = len(rays.x), len(scratch)
     if not apart:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks, fused, pixels, random_points
@@ -31,6 +30,7 @@ from caustic_cli.optics.kernels.fresnel import FRESNEL
 from caustic_cli.optics.kernels.grid import rows_at
 from caustic_cli.optics.kernels.ray_intersections import RayIntersections
 from caustic_cli.optics.kernels.splat import trimmed
+from caustic_cli.optics.kernels.stage import Stage
 from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
 from caustic_cli.optics.kernels.threads import ALL
 from caustic_cli.optics.kernels.transfer import TargetPlane
@@ -70,11 +70,22 @@ class PlaneKernel:
         spaces, half_size: of the height field; half widths in mm.
         u, v: the rays' parameters; with `tensor` all pairs of them, else pairwise.
         power: of each ray below the surface, scalar or of the rays' shape.
+        origin: of the coordinates x and y, mm.
         like: the kernel of another sample, whose basis values along v serve again where v is the same tensor, and whose
             workspace serves both.
     """
 
-    def __init__(self, spaces, half_size, u: Tensor, v: Tensor, tensor: bool, power: Tensor, like: PlaneKernel | None = None):
+    def __init__(
+        self,
+        spaces,
+        half_size,
+        u: Tensor,
+        v: Tensor,
+        tensor: bool,
+        power: Tensor,
+        like: PlaneKernel | None = None,
+        origin: tuple[float, float] = (0.0, 0.0),
+    ):
         (su, sv), (rx, ry) = spaces, half_size
         self.tensor, self.v = tensor, v
         self.workspace: _Workspace = _Workspace() if like is None else like.workspace
@@ -93,7 +104,7 @@ class PlaneKernel:
             self.surface: FusedSurface = FusedSurface(spaces, half_size) if like is None else like.surface
             x, y, power = u.view(shape), v.view(shape), power.view(shape) if power.ndim else power
         self.shape = shape
-        coordinates = ((2.0 * x - 1.0) * rx, (2.0 * y - 1.0) * ry, power)
+        coordinates = ((2.0 * x - 1.0) * rx - origin[0], (2.0 * y - 1.0) * ry - origin[1], power)
         own_x, own_y, flux = (_strided(np.broadcast_to(t.double().numpy(), shape)) for t in coordinates)
         self.rays = RowsOfRays(own_x, own_y, _NONE, _NONE, flux)
 
@@ -137,6 +148,44 @@ class BeamKernel(PlaneKernel):
         (x, y, z), (rx, ry) = receiver.middle, self.half_size
         plane = TargetPlane.of((x, y, z - reference), receiver.axes, 1.0 if dot(receiver.axis, receiver.axes[2]) > 0 else -1.0)
         return ParallelLight(*self.k, self.power, 1.0 / rx, 1.0 / ry, self.round, plane)
+
+
+class PencilKernel(PlaneKernel):
+    """The same for the rays of a source point through a tensor product of points: see `optics.pencil`.
+
+    Args:
+        pencil: the rays; index: n of the entrance; emission: J, by `pencil.polynomial`, and the largest s.
+    """
+
+    def __init__(
+        self, spaces, half_size, pencil: Pencil, index: float, emission: tuple[np.ndarray, float], like: PencilKernel | None = None
+    ):
+        sample, self.place = pencil.sample, pencil.position[:2]
+        super().__init__(spaces, half_size, sample.u, sample.v, True, sample.flux, like, self.place)
+        self.distance, self.z_in, self.index = pencil.distance, pencil.z_in, index
+        self.coefficients, most = emission
+        self.scale = 2.0 / most
+        self.reach2 = float(np.square(self.rays.x).max() + np.square(self.rays.y).max())
+
+    def steps(self, thickest: float) -> int:
+        """Newton steps after which u is exact to rounding for any point at most `thickest` mm behind the entrance."""
+        q, z = (c.ravel() for c in np.meshgrid(np.linspace(0.0, self.reach2, 65), np.linspace(0.0, max(thickest, 0.0), 9)))
+        n, h = self.index, self.distance
+        u, steps = n / (n * h + z), 0
+        while True:
+            c = 1.0 / np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * u * u)
+            step = (u * (h + z * c) - 1.0) / (h + z * n * n * c**3)
+            if steps == MOST_STEPS or np.abs(step / u).max() < EXACT:
+                return steps
+            u, steps = u - step, steps + 1
+
+    def __call__(self, sag: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
+        """Control heights (n, m) float64 relative to `reference`, mm: see `_splat`."""
+        steps = self.steps(float(sag.detach().max()) + reference - self.z_in)
+        point = Point(float(self.distance), float(self.index), steps, self.scale, self.coefficients)
+        frame = ScreenFrame.of(screen, (screen.low[0] - self.place[0], screen.low[1] - self.place[1]))
+        ends = self.z_in - reference, screen.z - reference
+        return self._splatted(sag, (eta, fresnel), ends, screen, filter, (point, None), frame)
 
 
 class RayKernel:
@@ -195,54 +244,6 @@ def _way_inside(half_size: tuple[float, float], origin: tuple[Tensor, Tensor], d
     return way if bool((way > 0.0).any()) else None
 
 
-class PencilKernel:
-    """The fused form of `optics.pencil`, `interface.interact`, landing and `reconstruction.splat`.
-
-    Args:
-        spaces, half_size: of the height field; half widths in mm.
-        pencil: the rays; index: n of the entrance; emission: J, by `pencil.polynomial`, and the largest s.
-        like: the kernel of another chunk, whose basis values along v serve again where v is the same tensor, with its workspace.
-    """
-
-    def __init__(
-        self, spaces, half_size, pencil: Pencil, index: float, emission: tuple[np.ndarray, float], like: PencilKernel | None = None
-    ):
-        (su, sv), (rx, ry), u, v, area = spaces, half_size, pencil.sample.u, pencil.sample.v, pencil.sample.flux
-        self.v, self.rows = v, rows_at(su, u, rx)
-        self.along_v: AlongV = like.along_v if like is not None and like.v is v else AlongV(sv, v, 1.0 / (2.0 * ry))
-        self.workspace: _Workspace = _Workspace() if like is None else like.workspace
-        self.place, self.distance, self.z_in, self.index = pencil.position[:2], pencil.distance, pencil.z_in, index
-        x, y = ((2.0 * c - 1.0) * r - p for c, r, p in zip((u, v), half_size, self.place, strict=True))
-        at = (_strided(np.broadcast_to(c.double().numpy(), (len(u), len(v)))) for c in (x[:, None], y[None, :], area))
-        own_x, own_y, areas = at
-        self.rays = RowsOfRays(own_x, own_y, _NONE, _NONE, areas)
-        self.coefficients, most = emission
-        self.scale = 2.0 / most
-        self.reach2 = float(x.abs().max() ** 2 + y.abs().max() ** 2)
-
-    def steps(self, thickest: float) -> int:
-        """Newton steps after which u is exact to rounding for any point at most `thickest` mm behind the entrance."""
-        q, z = (c.ravel() for c in np.meshgrid(np.linspace(0.0, self.reach2, 65), np.linspace(0.0, max(thickest, 0.0), 9)))
-        n, h = self.index, self.distance
-        u, steps = n / (n * h + z), 0
-        while True:
-            c = 1.0 / np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * u * u)
-            step = (u * (h + z * c) - 1.0) / (h + z * n * n * c**3)
-            if steps == MOST_STEPS or np.abs(step / u).max() < EXACT:
-                return steps
-            u, steps = u - step, steps + 1
-
-    def __call__(self, sag: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
-        """Control heights (n, m) float64 relative to `reference`, mm: see `_splat`."""
-        steps = self.steps(float(sag.detach().max()) + reference - self.z_in)
-        point = Point(float(self.distance), float(self.index), steps, self.scale, self.coefficients)
-        frame = ScreenFrame.of(screen, (screen.low[0] - self.place[0], screen.low[1] - self.place[1]))
-        net, net_y = self.along_v(sag)
-        ends = self.z_in - reference, screen.z - reference
-        nets, light = (net, net, net_y), (point, None)
-        return _splat(nets, self.rows, False, self.rays, (eta, fresnel), ends, screen, filter, self.workspace, light, frame)
-
-
 #: Largest number of Newton steps, and the relative size of a step that is not taken, since the next would be its square.
 MOST_STEPS, EXACT = 30, 1e-13
 
@@ -267,7 +268,7 @@ def _splat(
         image (n_x, n_y) and the power behind the lens (), float64, differentiable; losses by name.
     """
     arguments = _arguments(rays, interface, ends, frame or ScreenFrame.of(screen), filter, light)
-    padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
+    padded, leaving, ledger = _IMAGE((rows, apart, arguments, workspace), *nets)
     image, beside = trimmed(padded, screen, filter)
     lost = {"missed_surface": ledger[fused.MISSED]} if rays.along_x is not _NONE else {}
     lost |= {"fresnel": ledger[fused.LOST_BY_FRESNEL], "total_internal_reflection": ledger[fused.REFLECTED]}
@@ -318,60 +319,44 @@ def compile_surface() -> None:
 
 def compile_splat() -> None:
     """Compile the fused refraction, transfer and splat."""
-    _Image.apply(*_example())
+    _IMAGE(*_example())
 
 
 def compile_adjoint() -> None:
     """Compile the adjoint of the kernel of `compile_splat`."""
-    *nets, rows, apart, arguments, workspace = _example()
-    _adjoint(
-        torch.zeros(_images(arguments, workspace)[0].shape[1:], dtype=torch.float64), 1.0, nets, rows, apart, arguments, workspace
-    )
+    parameters, *nets = _example()
+    image = np.zeros(_images(*parameters[2:])[0].shape[1:])
+    _adjoint(parameters, [t.numpy() for t in nets], (), (image, 1.0), (True, True, True))
 
 
 def _example() -> tuple:
-    """Arguments of `_Image` for a few rays."""
+    """Arguments of `_IMAGE` for a few rays."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2, dtype=torch.float64)
     kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, True, torch.tensor(0.25, dtype=torch.float64))
     net, screen = torch.zeros(4, 2, dtype=torch.float64), Screen((10.0, 10.0), 10.0, (4, 4))
     arguments = _arguments(kernel.rays, (1.5, "exact"), (0.0, 10.0), ScreenFrame.of(screen), Filter("cosine", (3, 3)))
-    return net, net, net, kernel.rows, False, arguments, kernel.workspace
+    return (kernel.rows, False, arguments, kernel.workspace), net, net, net
 
 
-class _Image(torch.autograd.Function):
-    """Three nets (n, b) and the arguments of `fused.forward` -> padded image, power behind the lens (), ledger."""
-
-    @staticmethod
-    def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace):
-        images, scratch = _images(arguments, workspace)
-        ledgers = np.empty((len(images), fused.COLUMNS))
-        fused.forward(ALL, images, ledgers, scratch, _surface(rows, (net, net_x, net_y)), *arguments)
-        ledger = ledgers.sum(0)
-        leaving = torch.tensor(ledger[fused.LEAVING], dtype=torch.float64)
-        return torch.from_numpy(pixels.total(images)), leaving, torch.from_numpy(ledger)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        *nets, ctx.rows, ctx.apart, ctx.arguments, ctx.workspace = inputs
-        ctx.save_for_backward(*nets)
-        ctx.mark_non_differentiable(output[2])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, by_image, by_leaving, _):
-        sums = _adjoint(by_image, float(by_leaving), ctx.saved_tensors, ctx.rows, ctx.apart, ctx.arguments, ctx.workspace)
-        nets = (torch.from_numpy(s[0] if ctx.apart else pixels.total(s)) for s in sums)
-        return *nets, None, None, None, None
+def _forward(parameters: tuple, *nets):
+    """Padded image, power behind the lens (), ledger, from nets (n, b)."""
+    rows, _, arguments, workspace = parameters
+    images, scratch = _images(arguments, workspace)
+    ledgers = np.empty((len(images), fused.COLUMNS))
+    fused.forward(ALL, images, ledgers, scratch, RowsOfSurface(*rows, *nets), *arguments)
+    ledger = ledgers.sum(0)
+    return pixels.total(images), ledger[fused.LEAVING], ledger
 
 
-def _adjoint(
-    by_image: Tensor, by_leaving: float, nets, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace
-) -> np.ndarray:
-    """Derivatives by the three nets (n, b), a sum for each block: (3, blocks, n, b), or (3, 1, n, b) with `apart`."""
+def _adjoint(parameters: tuple, nets, _kept, by, _wanted):
+    rows, apart, arguments, workspace = parameters
     scratch, shape = _images(arguments, workspace)[1], nets[0].shape
     sums = np.empty((3, 1, *shape)) if apart else workspace("nets", 3, len(scratch), *shape)
-    fused.backward(ALL, by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, _surface(rows, nets), *arguments)
-    return sums
+    fused.backward(ALL, by[0], float(by[1]), apart, sums, scratch, RowsOfSurface(*rows, *nets), *arguments)
+    return [s[0] if apart else pixels.total(s) for s in sums]
+
+
+_IMAGE = Stage(_forward, _adjoint, 2)
 
 
 def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
@@ -380,10 +365,6 @@ def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.nda
     count = blocks()
     images = workspace("images", count, *splat.padded(frame))
     return images, workspace("scratch", count, fused.scratch_rows(splat), rays.x.shape[1])
-
-
-def _surface(rows: tuple, nets) -> RowsOfSurface:
-    return RowsOfSurface(*rows, *(t.detach().contiguous().numpy() for t in nets))
 
 
 def scattered_points(keys, salts, start: int, stop: int, nu: int, nv: int, stratified: bool) -> tuple[Tensor, Tensor]:

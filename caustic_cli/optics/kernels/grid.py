@@ -14,9 +14,7 @@ by_v is the derivative of whatever is differentiated by v.
 from __future__ import annotations
 
 import numpy as np
-import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
@@ -25,6 +23,7 @@ from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import total
 from caustic_cli.optics.kernels.rows import combine, spread
+from caustic_cli.optics.kernels.stage import Stage, empty
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
@@ -49,14 +48,14 @@ class GridSurface:
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heights (n, m) mm float64 -> z mm, dz/dx, dz/dy, each (a b,) float64, linear in the heights."""
-        return _Rows.apply(*self.along_v(heights), self.rows)
+        z, zx, zy = _ROWS(self.rows, *self.along_v(heights))
+        return z, zx, zy
 
 
 @njit(entry=True, **FAST)
 def _combine(block, surface, z, zx, zy, blocks):
     """z and slopes (a, b)."""
-    if block == ALL:
-        on_threads(blocks, (surface, z, zx, zy, blocks))
+    if on_threads(block, blocks, (surface, z, zx, zy, blocks)):
         return
     for i in range(block * len(z) // blocks, (block + 1) * len(z) // blocks):
         combine(i, surface, z[i], zx[i], zy[i])
@@ -66,33 +65,24 @@ def _combine(block, surface, z, zx, zy, blocks):
 def _spread(block, by_z, by_zx, by_zy, surface, nets):
     """Adjoint of `_combine`: derivatives by both nets, a set for each block; nets (3, blocks, n, b) are overwritten."""
     rows, blocks = len(by_z), nets.shape[1]
-    if block == ALL:
-        on_threads(blocks, (by_z, by_zx, by_zy, surface, nets))
+    if on_threads(block, blocks, (by_z, by_zx, by_zy, surface, nets)):
         return
     nets[:, block] = 0.0
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
         spread(i, surface, by_z[i], by_zx[i], by_zy[i], nets[:, block], False)
 
 
-class _Rows(torch.autograd.Function):
-    """Q, Q_y and the rows' basis values -> z and slopes, (a b,)."""
+def _forward(rows: tuple[np.ndarray, np.ndarray, np.ndarray], net, net_y):
+    """z and slopes, (a b,), from Q, Q_y and the rows' basis values."""
+    out = [empty(len(rows[0]), net.shape[1]) for _ in range(3)]
+    _combine(ALL, RowsOfSurface(*rows, net, net, net_y), *out, blocks())
+    return [t.reshape(-1) for t in out]
 
-    @staticmethod
-    def forward(net: Tensor, net_y: Tensor, rows: tuple):
-        shape = len(rows[0]), net.shape[1]
-        out = [torch.empty(shape[0] * shape[1], dtype=torch.float64) for _ in range(3)]
-        nets = (t.detach().contiguous().numpy() for t in (net, net, net_y))
-        _combine(ALL, RowsOfSurface(*rows, *nets), *(t.numpy().reshape(shape) for t in out), blocks())
-        return tuple(out)
 
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        net, _, rows = inputs
-        ctx.shape, ctx.rows = net.shape, rows
+def _adjoint(rows: tuple[np.ndarray, np.ndarray, np.ndarray], inputs, _kept, by, _wanted):
+    nets, shape, none = np.empty((3, blocks(), *inputs[0].shape)), (len(rows[0]), inputs[0].shape[1]), np.empty((0, 0))
+    _spread(ALL, *(b.reshape(shape) for b in by), RowsOfSurface(*rows, none, none, none), nets)
+    return total(nets[0]), total(nets[2])
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *by):
-        nets, shape = np.empty((3, blocks(), *ctx.shape)), (len(ctx.rows[0]), ctx.shape[1])
-        _spread(ALL, *(b.contiguous().numpy().reshape(shape) for b in by), RowsOfSurface(*ctx.rows, *[np.empty((0, 0))] * 3), nets)
-        return torch.from_numpy(total(nets[0])), torch.from_numpy(total(nets[2])), None
+
+_ROWS = Stage(_forward, _adjoint, 3)

@@ -15,7 +15,7 @@ import numpy as np
 
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.spline import jet, place
-from caustic_cli.optics.kernels.threads import ALL, on_threads
+from caustic_cli.optics.kernels.threads import on_threads
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, MOST_PROBES, MOST_STEPS
 
 HIT, MISSED, UNRESOLVED = 0, 1, 2
@@ -27,7 +27,7 @@ NEAR = 1e-3
 def value_at(c, u, v, pieces):
     """Z, Z_u, Z_v at (u, v)."""
     i, j, xi, eta = place(u, v, pieces)
-    z, z_xi, z_eta = jet(c, i, j, xi, eta)
+    z, z_xi, z_eta, _, _, _ = jet(c, i, j, xi, eta)
     return z, z_xi * pieces.over_u[i], z_eta * pieces.over_v[j]
 
 
@@ -150,8 +150,7 @@ def intersect(block, rays, start, limits, slopes, c, pieces, t, status, blocks):
 
     limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,): estimates of t, infinite for none.
     """
-    if block == ALL:
-        on_threads(blocks, (rays, start, limits, slopes, c, pieces, t, status, blocks))
+    if on_threads(block, blocks, (rays, start, limits, slopes, c, pieces, t, status, blocks)):
         return
     ou, ov, oz, du, dv, dz = rays
     count = len(ou)
@@ -171,8 +170,7 @@ def intersect_again(block, rays, side, limits, slopes, round_, step, halvings, m
     side: 1 above the surface, -1 under it; limits, slopes: as in `intersect`; round_: the surface ends at the circle inscribed
     in its aperture; step, halvings, most: least step (mm), bisections of the last one and most steps.
     """
-    if block == ALL:
-        on_threads(blocks, (rays, side, limits, slopes, round_, step, halvings, most, c, pieces, t, blocks))
+    if on_threads(block, blocks, (rays, side, limits, slopes, round_, step, halvings, most, c, pieces, t, blocks)):
         return
     ou, ov, oz, du, dv, dz = rays
     count, highest = len(ou), limits[1] if side > 0.0 else -limits[0]

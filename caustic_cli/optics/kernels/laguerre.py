@@ -80,8 +80,8 @@ def _envelope(i, across, psi, rows, first, y2, x1, x2, part, who, phi, site):
     """Row i, or then the strip i across all rows, of `envelope`."""
     n, m, k = len(x1), len(x2), len(rows)
     if i == ALL:
-        on_threads(k, (False, psi, rows, first, y2, x1, x2, part, who, phi, site))
-        on_threads((m + 15) // 16, (True, psi, rows, first, y2, x1, x2, part, who, phi, site))
+        on_threads(ALL, k, (False, psi, rows, first, y2, x1, x2, part, who, phi, site))
+        on_threads(ALL, (m + 15) // 16, (True, psi, rows, first, y2, x1, x2, part, who, phi, site))
         return
     if across:
         value, place, hull = np.empty((16, n)), np.empty((16, n), np.int32), np.empty(k, np.int32)
@@ -112,8 +112,8 @@ def _prices(i, across, phi, rows, first, y2, x1, x2, part, which, psi, at):
     """Column i of the raster, or then the row i of sites, of `prices`."""
     n, m, k = len(x1), len(x2), len(rows)
     if i == ALL:
-        on_threads(m, (False, phi, rows, first, y2, x1, x2, part, which, psi, at))
-        on_threads(k, (True, phi, rows, first, y2, x1, x2, part, which, psi, at))
+        on_threads(ALL, m, (False, phi, rows, first, y2, x1, x2, part, which, psi, at))
+        on_threads(ALL, k, (True, phi, rows, first, y2, x1, x2, part, which, psi, at))
         return
     if across:
         a, b = first[i], first[i + 1]
@@ -143,8 +143,7 @@ def walked(y1, y2, psi, first, other, begin, x1, x2):
 @njit(entry=True, nogil=True)
 def _walked(i, y1, y2, psi, first, other, begin, x1, x2, phi, site):
     """Row i of `walked`."""
-    if i == ALL:
-        on_threads(len(x1), (y1, y2, psi, first, other, begin, x1, x2, phi, site))
+    if on_threads(i, len(x1), (y1, y2, psi, first, other, begin, x1, x2, phi, site)):
         return
     p = begin
     for j in range(len(x2)):
@@ -193,8 +192,7 @@ def climbed(phi, y1, y2, x1, x2, begin):
 @njit(entry=True, nogil=True)
 def _climbed(task, phi, y1, y2, x1, x2, psi, at):
     """`climbed` for one of TASKS parts of the sites."""
-    if task == ALL:
-        on_threads(TASKS, (phi, y1, y2, x1, x2, psi, at))
+    if on_threads(task, TASKS, (phi, y1, y2, x1, x2, psi, at)):
         return
     n, m = phi.shape
     for p in range(task * len(psi) // TASKS, (task + 1) * len(psi) // TASKS):
@@ -225,8 +223,7 @@ def averages(phi, site, y1, y2, weights, step, low, out) -> None:
 def _averages(i, phi, site, y1, y2, weights, step, low, out):
     """Row i of `averages`."""
     n, m = out.shape[1:]
-    if i == ALL:
-        on_threads(n, (phi, site, y1, y2, weights, step, low, out))
+    if on_threads(i, n, (phi, site, y1, y2, weights, step, low, out)):
         return
     count = len(weights)
     sums = np.zeros((3, step * (m - 1) + count))
@@ -367,8 +364,7 @@ def cells(psi, y1, y2, site, seen, head, link, end, degree, f, values, a, b, sid
 @njit(entry=True, nogil=True)
 def _cells(task, psi, y1, y2, site, head, link, end, degree, f, level, a, b, sides, mass, weight):
     """`cells` for one of TASKS parts of the sites."""
-    if task == ALL:
-        on_threads(TASKS, (psi, y1, y2, site, head, link, end, degree, f, level, a, b, sides, mass, weight))
+    if on_threads(task, TASKS, (psi, y1, y2, site, head, link, end, degree, f, level, a, b, sides, mass, weight)):
         return
     low, high = task * len(psi) // TASKS, (task + 1) * len(psi) // TASKS
     room, flat = 0, f.size == 1

@@ -28,8 +28,7 @@ def total(images: np.ndarray) -> np.ndarray:
 @njit(entry=True, **FAST)
 def sums(i, images, out):
     """Rows of `total`."""
-    if i == ALL:
-        on_threads(len(out), (images, out))
+    if on_threads(i, len(out), (images, out)):
         return
     for j in range(images.shape[2]):
         out[i, j] = images[0, i, j]

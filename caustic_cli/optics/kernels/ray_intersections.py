@@ -14,10 +14,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import batches, blocks, intersect
 from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.stage import Stage
 from caustic_cli.optics.kernels.surface import FusedSurface, sag_of, scaled
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
@@ -47,7 +47,7 @@ def hits_of_rays(
     (ox, oy, oz), (dx, dy, dz) = origin, direction
     if side < 0:
         heights, oz, dz = -heights, -oz, -dz
-    t, gx, gy, *_ = _Hits.apply(heights, surface, None, ox, oy, oz, dx, dy, dz)
+    t, gx, gy, *_ = _HITS((surface, None), heights, ox, oy, oz, dx, dy, dz)
     found = t.detach() >= 0.0
     t = torch.where(found, t, torch.zeros_like(t))
     return (t, -gx, -gy, found) if side < 0 else (t, gx, gy, found)
@@ -75,7 +75,8 @@ class RayIntersections:
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heights (n, m) mm -> distance along each ray to its hit (mm; -1 for none), dz/dx and dz/dy there, (N,) float64."""
-        return _Hits.apply(heights, self.surface, self)[:3]
+        t, gx, gy, *_ = _HITS((self.surface, self), heights)
+        return t, gx, gy
 
     def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
         """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
@@ -150,8 +151,7 @@ def enter(block, rays, floor, way, blocks):
 
     floor: of the box, mm.  A ray that never enters is placed outside the aperture.
     """
-    if block == ALL:
-        on_threads(blocks, (rays, floor, way, blocks))
+    if on_threads(block, blocks, (rays, floor, way, blocks)):
         return
     ou, ov, oz, du, dv, dz = rays
     count = len(ou)
@@ -168,34 +168,21 @@ def enter(block, rays, floor, way, blocks):
             oz[k], way[k] = oz[k] + t * dz[k], t
 
 
-class _Hits(torch.autograd.Function):
-    """Heights, and fixed rays or components of others -> t (-1 for none), slopes; numbers and span products; coefficients."""
+def _forward(parameters: tuple[FusedSurface, RayIntersections | None], heights, *ray):
+    """Of fixed rays, or of the components of others: t (-1 for none), slopes; numbers and span products; coefficients."""
+    (surface, fixed), heights = parameters, torch.from_numpy(heights)
+    c, (_, *hits) = fixed.search(heights) if fixed else _enter_and_hit(surface, heights, ray[:3], ray[3:])
+    return *hits, c
 
-    @staticmethod
-    def forward(heights: Tensor, surface: FusedSurface, fixed: RayIntersections | None, *ray):
-        c, (_, *hits) = fixed.search(heights) if fixed else _enter_and_hit(surface, heights, ray[:3], ray[3:])
-        return *(torch.from_numpy(a) for a in hits), torch.from_numpy(c)
 
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        heights, ctx.surface, ctx.fixed, *ray = inputs
-        ctx.save_for_backward(*output, heights, *ray)
-        ctx.mark_non_differentiable(*output[3:])
+def _adjoint(parameters: tuple[FusedSurface, RayIntersections | None], inputs, kept, by, wanted):
+    (surface, fixed), ray, (*found, met, where, c), (for_heights, *wanted) = parameters, inputs[1:], kept, wanted
+    rays = fixed.rays if fixed else scaled(surface, ray[:3], ray[3:])
+    grads = surface.workspace() if for_heights else np.empty((blocks(), 0, *c.shape[1:]))
+    starts = tuple(np.empty(len(met) if any(wanted) else 0) for _ in range(3))
+    batches.pull_back(ALL, met, where, tuple(by), rays, tuple(found), c, surface.pieces, grads, starts)
+    along = [found[0] * a for a in starts] if any(wanted) else starts
+    return surface.pull(grads) if for_heights else None, *[*starts, *along][: len(ray)]
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *by):
-        *found, met, where, c, heights = ctx.saved_tensors[:7]
-        ray, surface, (for_heights, _, _, *wanted) = ctx.saved_tensors[7:], ctx.surface, ctx.needs_input_grad
-        rays = ctx.fixed.rays if ctx.fixed else scaled(surface, ray[:3], ray[3:])
-        grads = surface.workspace() if for_heights else np.empty((blocks(), 0, *c.shape[1:]))
-        starts = [torch.empty(len(met) if any(wanted) else 0, dtype=torch.float64) for _ in range(3)]
-        given, found_, starts_ = (tuple(t.detach().double().contiguous().numpy() for t in ts) for ts in (by[:3], found, starts))
-        batches.pull_back(ALL, met.numpy(), where.numpy(), given, rays, found_, c.numpy(), surface.pieces, grads, starts_)
-        out = [*starts, *(found[0].detach() * a for a in starts)] if any(wanted) else [None] * len(ray)
-        return (
-            surface.pull(grads).to(heights.dtype) if for_heights else None,
-            None,
-            None,
-            *(a if w else None for a, w in zip(out, wanted, strict=True)),
-        )
+
+_HITS = Stage(_forward, _adjoint, 3, keeps=True)

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from caustic_cli.optics.kernels.fresnel import FRESNEL, cosine_behind, reflectance
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import RayStage, load, store, store_flags
+from caustic_cli.optics.kernels.stage import load, ray_stage, store, store_flags
 from caustic_cli.optics.tolerances import NORMAL
 
 # Rows of a batch's scratch: the ray, f; t and P', or in the adjoint derivatives by them, and whether light passes; derivatives by
@@ -171,7 +171,7 @@ def _refract_adjoint(v, start, count, ray, surface, given, out):
         store(v[BY_DX + i], start, count, out[i])
 
 
-REFRACT = RayStage.of(_refract, _refract_adjoint, ROWS, 4)
+REFRACT = ray_stage(_refract, _refract_adjoint, ROWS, 4)
 
 
 def interact(direction, slopes, power: Tensor, *, eta: float, fresnel: str, field=None):

@@ -20,9 +20,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels import rows as row
@@ -30,7 +28,7 @@ from caustic_cli.optics.kernels.arguments import ScreenFrame, Splat
 from caustic_cli.optics.kernels.filter_weights import pixel_weights
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits, total
-from caustic_cli.optics.kernels.stage import load, store
+from caustic_cli.optics.kernels.stage import Stage, load, store
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
@@ -168,7 +166,7 @@ def splat_rays(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Fil
     Returns:
         image (n_x, n_y), power per pixel; off_screen, the power that fell outside the frame; both float64 and differentiable.
     """
-    padded, outside = _Splat.apply(x, y, weight, ScreenFrame.of(screen), Splat.of(filter))
+    padded, outside = _SPLAT((ScreenFrame.of(screen), Splat.of(filter)), x, y, weight)
     image, beside = trimmed(padded, screen, filter)
     return image, outside + beside
 
@@ -209,8 +207,7 @@ def aim(x, y, weight, start, count, frame, v):
 def _splat(block, x, y, weight, frame, splat, images, outside):
     """Blocks' images, whose `total` is the padded one, and weights outside (blocks,): both are overwritten."""
     rows, blocks = -(-len(x) // ROW), len(images)
-    if block == ALL:
-        on_threads(blocks, (x, y, weight, frame, splat, images, outside))
+    if on_threads(block, blocks, (x, y, weight, frame, splat, images, outside)):
         return
     images[block], outside[block] = 0.0, 0.0
     v, sx, sy, dx, dy, column, _ = _cut(splat)
@@ -224,8 +221,7 @@ def _splat(block, x, y, weight, frame, splat, images, outside):
 @njit(entry=True, **FAST)
 def _splat_adjoint(block, x, y, weight, frame, splat, grad, by_outside, out, blocks):
     """Derivatives by x, y and weight into `out`, from those by the padded image and the weight outside."""
-    if block == ALL:
-        on_threads(blocks, (x, y, weight, frame, splat, grad, by_outside, out, blocks))
+    if on_threads(block, blocks, (x, y, weight, frame, splat, grad, by_outside, out, blocks)):
         return
     rows = -(-len(x) // ROW)
     v, sx, sy, dx, dy, column, tilt = _cut(splat)
@@ -239,24 +235,18 @@ def _splat_adjoint(block, x, y, weight, frame, splat, grad, by_outside, out, blo
         store(v[row.BY_POWER], i * ROW, count, out[2])
 
 
-class _Splat(torch.autograd.Function):
-    """x, y, weight, frame and filter -> padded image, the weight outside ()."""
+def _forward(parameters: tuple[ScreenFrame, Splat], x, y, weight):
+    """Padded image, the weight outside ()."""
+    frame, splat = parameters
+    images, outside = np.empty((blocks(), *splat.padded(frame))), np.empty(blocks())
+    _splat(ALL, x, y, weight, frame, splat, images, outside)
+    return total(images), outside.sum()
 
-    @staticmethod
-    def forward(x, y, weight, frame: ScreenFrame, splat: Splat):
-        images, outside = np.empty((blocks(), *splat.padded(frame))), np.empty(blocks())
-        _splat(ALL, *(t.detach().contiguous().numpy() for t in (x, y, weight)), frame, splat, images, outside)
-        return torch.from_numpy(total(images)), torch.tensor(outside.sum(), dtype=torch.float64)
 
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        *rays, ctx.frame, ctx.splat = inputs
-        ctx.save_for_backward(*rays)
+def _adjoint(parameters: tuple[ScreenFrame, Splat], rays, _kept, by, wanted):
+    out = tuple(np.empty(len(rays[0]) if w else 0) for w in wanted)
+    _splat_adjoint(ALL, *rays, *parameters, by[0], float(by[1]), out, blocks())
+    return out
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, by_image, by_outside):
-        rays, wanted = [t.detach().contiguous().numpy() for t in ctx.saved_tensors], ctx.needs_input_grad[:3]
-        out = tuple(np.empty(len(rays[0]) if w else 0) for w in wanted)
-        _splat_adjoint(ALL, *rays, ctx.frame, ctx.splat, by_image.contiguous().numpy(), float(by_outside), out, blocks())
-        return *(torch.from_numpy(a) if w else None for a, w in zip(out, wanted, strict=True)), None, None
+
+_SPLAT = Stage(_forward, _adjoint, 2)

@@ -21,7 +21,7 @@ import torch
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.threads import ALL, on_threads
+from caustic_cli.optics.kernels.threads import on_threads
 
 
 class Pieces(NamedTuple):
@@ -62,8 +62,7 @@ def axis(space: SplineSpace) -> Axis:
 @njit(entry=True, **FAST)
 def coefficients(i, heights, first_u, mu, first_v, mv, out):
     """(n, m) control heights -> out (I, J, p + 1, q + 1)."""
-    if i == ALL:
-        on_threads(len(mu), (heights, first_u, mu, first_v, mv, out))
+    if on_threads(i, len(mu), (heights, first_u, mu, first_v, mv, out)):
         return
     p, q = mu.shape[1], mv.shape[1]
     part = np.zeros(heights.shape[1])
@@ -88,8 +87,7 @@ def pull_coefficients(i, grads, first_u, mu, first_v, mv, rows, out):
 
     rows (I, p + 1, m): scratch, zero as `out` is.
     """
-    if i == ALL:
-        on_threads(len(mu), (grads, first_u, mu, first_v, mv, rows, out))
+    if on_threads(i, len(mu), (grads, first_u, mu, first_v, mv, rows, out)):
         for k in range(len(mu)):
             for a in range(rows.shape[1]):
                 for j in range(rows.shape[2]):
@@ -134,28 +132,12 @@ def place(u, v, pieces):
 
 @njit(inline="always", **FAST)
 def jet(c, i, j, xi, eta):
-    """z and its derivatives by xi and eta."""
-    p, q = c.shape[2], c.shape[3]
-    z, z_xi, z_eta = 0.0, 0.0, 0.0
-    for a in range(p - 1, -1, -1):
-        row, slope = c[i, j, a, q - 1], 0.0
-        for b in range(q - 2, -1, -1):
-            slope = slope * eta + row
-            row = row * eta + c[i, j, a, b]
-        z_xi = z_xi * xi + z
-        z = z * xi + row
-        z_eta = z_eta * xi + slope
-    return z, z_xi, z_eta
-
-
-@njit(inline="always", **FAST)
-def curvatures(c, i, j, xi, eta):
-    """Second derivatives of z by xi xi, xi eta, eta eta."""
+    """z, its derivatives by xi and eta, and the second by xi xi, xi eta, eta eta; inlined: what is not used is not computed."""
     p, q = c.shape[2], c.shape[3]
     z, z_xi, half_xi, z_eta, mixed, half_eta = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for a in range(p - 1, -1, -1):
-        row, slope, half = 0.0, 0.0, 0.0
-        for b in range(q - 1, -1, -1):
+        row, slope, half = c[i, j, a, q - 1], 0.0, 0.0
+        for b in range(q - 2, -1, -1):
             half = half * eta + slope
             slope = slope * eta + row
             row = row * eta + c[i, j, a, b]
@@ -165,7 +147,7 @@ def curvatures(c, i, j, xi, eta):
         mixed = mixed * xi + z_eta
         z_eta = z_eta * xi + slope
         half_eta = half_eta * xi + half
-    return 2.0 * half_xi, mixed, 2.0 * half_eta
+    return z, z_xi, z_eta, 2.0 * half_xi, mixed, 2.0 * half_eta
 
 
 @njit(inline="always", **FAST)
@@ -190,13 +172,12 @@ def push_powers(grad, i, j, xi, eta, by_z, by_xi, by_eta, powers):
 @njit(entry=True, **FAST)
 def evaluate(block, u, v, c, pieces, z, zx, zy, blocks):
     """Height and slopes at points (u, v) (N,) into z, zx, zy (N,)."""
-    if block == ALL:
-        on_threads(blocks, (u, v, c, pieces, z, zx, zy, blocks))
+    if on_threads(block, blocks, (u, v, c, pieces, z, zx, zy, blocks)):
         return
     count = len(u)
     for k in range(block * count // blocks, (block + 1) * count // blocks):
         i, j, xi, eta = place(u[k], v[k], pieces)
-        value, along, across = jet(c, i, j, xi, eta)
+        value, along, across, _, _, _ = jet(c, i, j, xi, eta)
         z[k], zx[k], zy[k] = value, along * pieces.over_u[i] * pieces.scale_x, across * pieces.over_v[j] * pieces.scale_y
 
 
@@ -218,8 +199,7 @@ def evaluate_net(block, u, v, net, linear, pieces, z, zx, zy, blocks):
 
     linear: `first` and `matrices` of both axes.
     """
-    if block == ALL:
-        on_threads(blocks, (u, v, net, linear, pieces, z, zx, zy, blocks))
+    if on_threads(block, blocks, (u, v, net, linear, pieces, z, zx, zy, blocks)):
         return
     fu, tu, fv, tv = linear
     count, along_u, along_v = len(u), np.empty((2, tu.shape[1])), np.empty((2, tv.shape[1]))
@@ -244,8 +224,7 @@ def evaluate_net(block, u, v, net, linear, pieces, z, zx, zy, blocks):
 def pull_back(block, u, v, gz, gx, gy, pieces, grads):
     """Adjoint of `evaluate`: derivatives by the coefficients into grads (blocks, I, J, p + 1, q + 1), overwritten."""
     count, blocks = len(u), len(grads)
-    if block == ALL:
-        on_threads(blocks, (u, v, gz, gx, gy, pieces, grads))
+    if on_threads(block, blocks, (u, v, gz, gx, gy, pieces, grads)):
         return
     grad = grads[block]
     grad[:] = 0.0

@@ -1,4 +1,5 @@
-"""The stages of a trace that treat each ray by itself, as differentiable torch functions: each is given by two batch functions.
+"""Kernels as differentiable torch functions, by a forward and an adjoint function of arrays; and the stages of a trace that treat
+each ray by itself, which are given by two batch functions,
 
     forward, adjoint (v, start, count, ray, parameters, given, out)
 
@@ -11,6 +12,7 @@ over them are vectorised without checks for overlap.  Everything is float64.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -66,78 +68,94 @@ def _kernel(batch, rows: int):
 
     @njit(entry=True, **FAST)
     def kernel(block, count, ray, parameters, given, out, blocks):
-        if block == ALL:
-            on_threads(blocks, (count, ray, parameters, given, out, blocks))
+        if on_threads(block, blocks, (count, ray, parameters, given, out, blocks)):
             return
         some(block * count // blocks, (block + 1) * count // blocks, ray, parameters, given, out)
 
     return kernel
 
 
-def _run(kernel, count: int, *arguments) -> None:
-    """Call such a kernel with tensors, also in tuples, in place of arrays."""
-    kernel(ALL, count, *map(_arrays, arguments), blocks())
+class Stage(NamedTuple):
+    """A torch function of float64 arrays, differentiable once, in reverse mode, by its kernels.
 
+    forward (parameters, *inputs): its results, of which the first `results` are differentiable.
+    adjoint (parameters, inputs, kept, by, wanted): derivatives by the inputs, from those by these results; None where one is not
+    wanted.  kept: what `forward` gave, with `keeps`, or nothing.
 
-def _arrays(value):
-    if isinstance(value, Tensor):
-        return value.numpy()
-    return tuple(map(_arrays, value)) if type(value) is tuple else value  # a named one is of numbers
+    An input is a tensor or, for all rays, a number.
+    """
 
+    forward: Callable[..., Sequence[np.ndarray]]
+    adjoint: Callable[..., Sequence[np.ndarray | None]]
+    results: int
+    keeps: bool = False
+    kernels: tuple = ()
 
-class RayStage(NamedTuple):
-    """A stage: the kernels of its batch functions, and how many results it has."""
-
-    kernels: tuple
-    outputs: int
-
-    @classmethod
-    def of(cls, forward, adjoint, rows: int, outputs: int) -> RayStage:
-        """By its batch functions; rows: of scratch that these use."""
-        return cls((_kernel(forward, rows), _kernel(adjoint, rows)), outputs)
-
-    def __call__(self, parameters: tuple, *ray: Tensor | float) -> tuple[Tensor, ...]:
-        """Results (N,) of rays, each component a tensor (N,) or a number, and whether each goes on, (N,) bool.
-
-        Differentiable once, in reverse mode.
-        """
-        return _Applied.apply(self, parameters, *ray)
+    def __call__(self, parameters, *inputs: Tensor | float) -> tuple[Tensor, ...]:
+        """All results."""
+        return _Applied.apply(self, parameters, *inputs)
 
 
 class _Applied(torch.autograd.Function):
     @staticmethod
-    def forward(stage: RayStage, parameters: tuple, *ray):
-        like = _like(ray)
-        out, flags = tuple(torch.empty_like(like) for _ in range(stage.outputs)), torch.empty_like(like, dtype=torch.bool)
-        _run(stage.kernels[0], len(like), _components(ray, like), parameters, (), (out, flags))
-        return *out, flags
+    def forward(stage: Stage, parameters, *inputs):
+        return tuple(torch.from_numpy(np.asarray(a)) for a in stage.forward(parameters, *map(array, inputs)))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.stage, ctx.parameters, *ray = inputs
-        ctx.save_for_backward(*(v if isinstance(v, Tensor) else None for v in ray))
-        ctx.numbers = [None if isinstance(v, Tensor) else v for v in ray]
-        ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(output[-1])
+        ctx.stage, ctx.parameters, *values = inputs
+        ctx.numbers = [None if isinstance(v, Tensor) else v for v in values]
+        ctx.save_for_backward(*(v if isinstance(v, Tensor) else None for v in values), *(output if ctx.stage.keeps else ()))
+        ctx.mark_non_differentiable(*output[ctx.stage.results :])
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *by):
-        ray = tuple(n if t is None else t for t, n in zip(ctx.saved_tensors, ctx.numbers, strict=True))
-        like, wanted = _like(ray), ctx.needs_input_grad[2:]
-        out = tuple(torch.empty_like(like) if w else like.new_empty(0) for w in wanted)
-        _run(ctx.stage.kernels[1], len(like), _components(ray, like), ctx.parameters, _components(by[:-1], like), out)
-        return None, None, *(a if w else None for a, w in zip(out, wanted, strict=True))
+        (stage, count), wanted = (ctx.stage, len(ctx.numbers)), ctx.needs_input_grad[2:]
+        tensors, kept = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
+        inputs = [n if t is None else array(t) for t, n in zip(tensors, ctx.numbers, strict=True)]
+        out = stage.adjoint(ctx.parameters, inputs, [t.numpy() for t in kept], [array(t) for t in by[: stage.results]], wanted)
+        found = (torch.from_numpy(a).to(t.dtype) if w else None for a, t, w in zip(out, tensors, wanted, strict=True))
+        return None, None, *found
 
 
-def _like(ray) -> Tensor:
-    """A component of all rays, (N,) float64."""
-    return next(c for c in ray if isinstance(c, Tensor)).detach().double().contiguous()
+def array(value):
+    """A tensor as a contiguous float64 array; anything else as it is."""
+    return value.detach().double().contiguous().numpy() if isinstance(value, Tensor) else value
 
 
-def _components(values, like: Tensor) -> tuple[Tensor, ...]:
-    """(N,) of a tensor, (1,) of a number; None stands for 0."""
-    return tuple(
-        v.detach().double().contiguous() if isinstance(v, Tensor) else like.new_full((1,), 0.0 if v is None else float(v))
-        for v in values
-    )
+def empty(*shape: int) -> np.ndarray:
+    """Memory of torch's, which is reused sooner than NumPy's."""
+    return torch.empty(shape, dtype=torch.float64).numpy()
+
+
+def ray_stage(forward, adjoint, rows: int, outputs: int) -> Stage:
+    """By batch functions: results (N,) of rays, each component a tensor (N,) or a number, and whether each goes on, (N,) bool.
+
+    rows: of scratch that these use; outputs: number of results.
+    """
+    run, run_back = _kernel(forward, rows), _kernel(adjoint, rows)
+
+    def whole(parameters: tuple, *ray):
+        count = _count(ray)
+        out, flags = tuple(empty(count) for _ in range(outputs)), np.empty(count, np.bool_)
+        run(ALL, count, _components(ray), parameters, (), (out, flags), blocks())
+        return *out, flags
+
+    def back(parameters: tuple, ray, _kept, by, wanted):
+        count = _count(ray)
+        out = tuple(empty(count if w else 0) for w in wanted)
+        run_back(ALL, count, _components(ray), parameters, tuple(by), out, blocks())
+        return out
+
+    return Stage(whole, back, outputs, kernels=(run, run_back))
+
+
+def _count(ray) -> int:
+    """Number of rays."""
+    return next(len(c) for c in ray if isinstance(c, np.ndarray))
+
+
+def _components(ray) -> tuple[np.ndarray, ...]:
+    """(N,) of an array, (1,) of a number."""
+    return tuple(c if isinstance(c, np.ndarray) else np.full(1, float(c)) for c in ray)

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import batches, blocks, intersect, spline
+from caustic_cli.optics.kernels.stage import Stage, array
 from caustic_cli.optics.kernels.threads import ALL
 
 #: Points per piece of the surface below which they are evaluated from the control heights instead of from all coefficients.
@@ -40,20 +40,19 @@ class FusedSurface:
         self.last = heights.clone(), out
         return out
 
-    def evaluate(self, heights: Tensor, u: np.ndarray, v: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+    def evaluate(self, heights: np.ndarray, u: np.ndarray, v: np.ndarray) -> list[np.ndarray]:
         """z mm, dz/dx and dz/dy at points in [0, 1]^2, all (N,) float64."""
-        found = [torch.empty(len(u), dtype=torch.float64) for _ in range(3)]
-        ends = (self.pieces, *(t.numpy() for t in found), blocks())
+        found = [np.empty(len(u)) for _ in range(3)]
         if len(u) < FEW * math.prod(self._coefficients()[:2]):
-            spline.evaluate_net(ALL, u, v, heights.detach().double().contiguous().numpy(), self.linear, *ends)
+            spline.evaluate_net(ALL, u, v, heights, self.linear, self.pieces, *found, blocks())
         else:
-            spline.evaluate(ALL, u, v, self.coefficients(heights), *ends)
-        return found[0], found[1], found[2]
+            spline.evaluate(ALL, u, v, self.coefficients(torch.from_numpy(heights)), self.pieces, *found, blocks())
+        return found
 
-    def pull_at(self, u: np.ndarray, v: np.ndarray, *by: Tensor) -> Tensor:
+    def pull_at(self, u: np.ndarray, v: np.ndarray, *by: np.ndarray) -> np.ndarray:
         """Adjoint of `evaluate`: derivatives by the heights, (n, m) float64."""
         grads = self.workspace()
-        spline.pull_back(ALL, u, v, *(g.contiguous().numpy() for g in by), self.pieces, grads)
+        spline.pull_back(ALL, u, v, *by, self.pieces, grads)
         return self.pull(grads)
 
     def order(self, x: Tensor, y: Tensor) -> tuple[np.ndarray, int]:
@@ -73,11 +72,11 @@ class FusedSurface:
             self.grads = np.zeros(shape)
         return self.grads
 
-    def pull(self, grads: np.ndarray) -> Tensor:
+    def pull(self, grads: np.ndarray) -> np.ndarray:
         """Derivatives by the coefficients, block by block -> by the heights, (n, m) float64."""
         (_, matrices, _, _), out = self.linear, np.zeros(self.shape)
         spline.pull_coefficients(ALL, grads, *self.linear, np.zeros((*matrices.shape[:2], self.shape[1])), out)
-        return torch.from_numpy(out)
+        return out
 
     def _coefficients(self) -> tuple[int, ...]:
         """Shape of all polynomials' coefficients."""
@@ -86,24 +85,16 @@ class FusedSurface:
 
 def scattered_surface(surface: FusedSurface, heights: Tensor, u, v) -> tuple[Tensor, Tensor, Tensor]:
     """Heights (n, m) mm, points in [0, 1]^2 (N,) -> z mm, dz/dx, dz/dy (N,) float64, linear in the heights."""
-    return _ScatteredSurface.apply(heights, surface, u, v)
+    z, zx, zy = _SCATTERED((surface, u, v), heights)
+    return z, zx, zy
 
 
-class _ScatteredSurface(torch.autograd.Function):
-    @staticmethod
-    def forward(heights: Tensor, surface, u, v):
-        return surface.evaluate(heights, u, v)
+def _pull_scattered(parameters, _inputs, _kept, by, _wanted):
+    surface, u, v = parameters
+    return (surface.pull_at(u, v, *by),)
 
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        heights, *ctx.rest = inputs
-        ctx.heights_dtype = heights.dtype
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *by):
-        surface, u, v = ctx.rest
-        return surface.pull_at(u, v, *by).to(ctx.heights_dtype), None, None, None
+_SCATTERED = Stage(lambda parameters, heights: parameters[0].evaluate(heights, *parameters[1:]), _pull_scattered, 3)
 
 
 def sag_of(heights: Tensor) -> tuple[Tensor, float]:
@@ -116,7 +107,7 @@ def sag_of(heights: Tensor) -> tuple[Tensor, float]:
 def scaled(surface: FusedSurface, o, d) -> tuple[np.ndarray, ...]:
     """o, d mm -> o_u, o_v, o_z, d_u, d_v, d_z, float64."""
     (su, sv), (ox, oy, oz), (dx, dy, dz) = surface.scale, o, d
-    return tuple(c.detach().double().contiguous().numpy() for c in (ox * su + 0.5, oy * sv + 0.5, oz, dx * su, dy * sv, dz))
+    return tuple(array(c) for c in (ox * su + 0.5, oy * sv + 0.5, oz, dx * su, dy * sv, dz))
 
 
 def next_intersections(

@@ -62,25 +62,29 @@ def _lent(context, builder, kind, value):
 
 
 @intrinsic
-def on_threads(_, count, arguments):
-    """Call the function that calls this, which returns nothing, as (k, *arguments) for every k < count.
+def on_threads(_, block, count, arguments):
+    """If `block` is ALL, call the function that calls this, which returns nothing, as (k, *arguments) for every k < count; whether
+    it is.
 
     Raises:
         MemoryError: one of the calls failed; kernels raise nothing else.
     """
 
     def generate(context, builder, signature, values):
-        place = cgutils.alloca_once_value(builder, values[1])
-        called = ir.Function(builder.module, CALLED, builder.module.get_unique_name("on_threads"))
-        called.linkage = "internal"
-        inside, (packed, k) = ir.IRBuilder(called.append_basic_block()), called.args
-        lent = _lent(context, inside, arguments, inside.load(inside.bitcast(packed, place.type)))
-        status, _ = context.call_conv.call_function(
-            inside, builder.function, types.none, (types.intp, *arguments.types), [k, *cgutils.unpack_tuple(inside, lent)]
-        )
-        inside.ret(inside.zext(status.is_error, CALLED.return_type))
-        addresses = [builder.ptrtoint(p, context.get_value_type(types.uintp)) for p in (called, place)]
-        context.compile_internal(builder, _start, types.void(types.uintp, types.uintp, types.intp), [*addresses, values[0]])
-        return context.get_dummy_value()
+        number, many, packed_ = values
+        every = builder.icmp_signed("==", number, ir.Constant(number.type, ALL))
+        with builder.if_then(every):
+            place = cgutils.alloca_once_value(builder, packed_)
+            called = ir.Function(builder.module, CALLED, builder.module.get_unique_name("on_threads"))
+            called.linkage = "internal"
+            inside, (packed, k) = ir.IRBuilder(called.append_basic_block()), called.args
+            lent = _lent(context, inside, arguments, inside.load(inside.bitcast(packed, place.type)))
+            status, _ = context.call_conv.call_function(
+                inside, builder.function, types.none, (types.intp, *arguments.types), [k, *cgutils.unpack_tuple(inside, lent)]
+            )
+            inside.ret(inside.zext(status.is_error, CALLED.return_type))
+            addresses = [builder.ptrtoint(p, context.get_value_type(types.uintp)) for p in (called, place)]
+            context.compile_internal(builder, _start, types.void(types.uintp, types.uintp, types.intp), [*addresses, many])
+        return every
 
-    return types.void(types.intp, arguments), generate
+    return types.boolean(types.intp, types.intp, arguments), generate

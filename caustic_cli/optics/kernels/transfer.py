@@ -16,7 +16,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import RayStage, load, store, store_flags
+from caustic_cli.optics.kernels.stage import load, ray_stage, store, store_flags
 from caustic_cli.optics.tolerances import PARALLEL
 
 OX, OY, OZ, DX, DY, DZ, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY, BY_DZ, ROWS = range(16)
@@ -132,7 +132,7 @@ def _land_adjoint(v, start, count, ray, plane, given, out):
         store(v[BY_OX + i], start, count, out[i])
 
 
-LAND = RayStage.of(_land, _land_adjoint, ROWS, 2)
+LAND = ray_stage(_land, _land_adjoint, ROWS, 2)
 
 
 def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float):
