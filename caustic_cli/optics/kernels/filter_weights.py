@@ -15,9 +15,8 @@ from caustic_cli.optics.kernels.jit import FAST, njit
 BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2
 #: Filters of `reconstruction` by name.
 KINDS = {"bincount": BINCOUNT, "gaussian": GAUSSIAN, "cosine": COSINE}
-#: Below this alpha (v/2)^2 the Gaussian's weights come from Taylor series, without cancellation.
-SMALL = 0.05
-TINY = 1e-3  # and below this from shorter ones
+#: Below this alpha (v/2)^2 the Gaussian's weights come from Taylor series, without cancellation, which costs 200 ulp above.
+SMALL = 5e-3
 #: Up to this alpha exp(-2 alpha q) stays within the reach of `_exp` and the recursion over pixels; above, plain exponentials.
 MODERATE = 2.0
 
@@ -77,14 +76,9 @@ def _mix(constant, a, b, x, y, out):
 
 
 @njit(inline="always", **FAST)
-def _short_series(phi, offset, square, alpha, out):
-    """`_series` where its arguments are below TINY."""
-    for j in range(len(phi)):
-        d = offset - phi[j]
-        room = max(square - d * d, 0.0)
-        x, y = alpha * room, alpha * d * d
-        p = 1.0 - x * (1 / 2.0) * (1.0 - x * (1 / 3.0) * (1.0 - x * (1 / 4.0)))
-        out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0))))
+def _decay(y):
+    """exp(-y) for y below SMALL: the first term left out is 3e-14."""
+    return 1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * (1.0 - y * (1 / 4.0))))
 
 
 @njit(inline="always", **FAST)
@@ -93,20 +87,16 @@ def _series(phi, offset, square, alpha, out):
     for j in range(len(phi)):
         d = offset - phi[j]
         room = max(square - d * d, 0.0)
-        x, y = alpha * room, alpha * d * d
-        e = 1.0 - y * (1 / 4.0) * (1.0 - y * (1 / 5.0) * (1.0 - y * (1 / 6.0)))
-        p = 1.0 - x * (1 / 5.0) * (1.0 - x * (1 / 6.0) * (1.0 - x * (1 / 7.0)))
-        p = 1.0 - x * (1 / 2.0) * (1.0 - x * (1 / 3.0) * (1.0 - x * (1 / 4.0) * p))
-        out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
+        x = alpha * room
+        p = 1.0 - x * (1 / 2.0) * (1.0 - x * (1 / 3.0) * (1.0 - x * (1 / 4.0) * (1.0 - x * (1 / 5.0))))
+        out[j] = room * p * _decay(alpha * d * d)
 
 
 @njit(inline="always", **FAST)
 def _series_slope(phi, offset, alpha, out):
     for j in range(len(phi)):
         d = offset - phi[j]
-        y = alpha * d * d
-        e = 1.0 - y * (1 / 4.0) * (1.0 - y * (1 / 5.0) * (1.0 - y * (1 / 6.0)))
-        out[j] = 2.0 * d * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
+        out[j] = 2.0 * d * _decay(alpha * d * d)
 
 
 @njit(inline="always", **FAST)
@@ -207,10 +197,7 @@ def pixel_weights(kind, v, alpha, phi, out, slope, over, lean, scratch):
     if alpha * square < SMALL:
         for k in range(v):
             offset = k - (v - 1) // 2 + 0.5
-            if alpha * square < TINY:
-                _short_series(phi, offset, square, alpha, out[k])
-            else:
-                _series(phi, offset, square, alpha, out[k])
+            _series(phi, offset, square, alpha, out[k])
             if len(slope):
                 _series_slope(phi, offset, alpha, slope[k])
     elif alpha <= MODERATE:
