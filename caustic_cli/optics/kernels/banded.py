@@ -12,7 +12,7 @@ from torch import Tensor
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import Stage
+from caustic_cli.optics.kernels.stage import KernelStage
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
@@ -68,4 +68,4 @@ def _adjoint(along: AlongV, _inputs, _kept, by, _wanted):
     return (out,)
 
 
-_CONTRACTION = Stage(_forward, _adjoint, 2)
+_CONTRACTION = KernelStage(_forward, _adjoint, 2)

@@ -358,12 +358,14 @@ def _turn(left, lone, to, fewest, rays, size, c, pieces, tile, hits):
 
 
 @njit(**FAST)
-def _one_by_one(lone, to, rays, limits, slopes, c, pieces, alone, hits):
+def _one_by_one(lone, to, rays, begin, limits, slopes, c, pieces, alone, hits):
     (ou, ov, oz, du, dv, dz), (status, reach, gx, gy, met, where) = rays, hits
     for k in range(lone):
         r = alone[k]
         slope = slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r])
-        t, status[r] = _root((ou[r], ov[r], oz[r], du[r], dv[r], dz[r]), -1.0, limits, slope, c, pieces)
+        t, status[r], guess = 0.0, MISSED, begin[r] if len(begin) > 0 else -1.0
+        if guess < np.inf:
+            t, status[r] = _root((ou[r], ov[r], oz[r], du[r], dv[r], dz[r]), guess, limits, slope, c, pieces)
         met[to], where[to], reach[r], gx[r], gy[r] = r, -1, -1.0, 0.0, 0.0
         if status[r] == HIT:
             u, v = ou[r] + t * du[r], ov[r] + t * dv[r]
@@ -374,13 +376,14 @@ def _one_by_one(lone, to, rays, limits, slopes, c, pieces, alone, hits):
 
 
 @njit(entry=True, **FAST)
-def first_hits(block, order, batched, rays, limits, slopes, round_, c, pieces, hits, blocks):
+def first_hits(block, order, batched, rays, begin, limits, slopes, round_, c, pieces, hits, blocks):
     """First intersections of rays, (o_u, o_v, o_z, d_u, d_v, d_z), (N,) each, into `hits`.
 
-    order (N,): of the rays; batched: whether to look for batches; limits: least and largest control height; slopes: bounds of
-    |Z_u| and |Z_v|; round_: radius of a circular aperture, mm, or infinite.
+    order (N,): of the rays; batched: whether to look for batches; begin: estimates of the distances of rays that are not, (N,),
+    infinite for none, or (0,); limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; round_: radius of a
+    circular aperture, mm, or infinite.
     """
-    if on_threads(block, blocks, (order, batched, rays, limits, slopes, round_, c, pieces, hits, blocks)):
+    if on_threads(block, blocks, (order, batched, rays, begin, limits, slopes, round_, c, pieces, hits, blocks)):
         return
     count, size, fewest = len(order), max(abs(limits[0]), abs(limits[1])), max(1, FEWEST // (c.shape[2] * c.shape[3]))
     some, together, alone = np.empty(TILE, np.int32), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
@@ -398,7 +401,7 @@ def first_hits(block, order, batched, rays, limits, slopes, round_, c, pieces, h
         for k in range(left):
             alone[lone] = at[some[k]]
             lone += 1
-        _one_by_one(lone, to, rays, limits, slopes, c, pieces, alone, hits)
+        _one_by_one(lone, to, rays, begin, limits, slopes, c, pieces, alone, hits)
         if round_ < np.inf:  # outside a circular aperture the ray has left the lens
             (ou, ov, _, du, dv, _), (status, reach, gx, gy, met, where) = rays, hits
             for k in range(first, last):

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import Stage
+from caustic_cli.optics.kernels.stage import KernelStage
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 #: Most basis functions that do not vanish at a point, along one axis: the scratch memory has (3, WIDE) numbers for each of three.
@@ -131,4 +131,4 @@ def _flow_adjoint(parameters: tuple[IndexFlow, tuple, np.ndarray, int], inputs, 
     return by_c.sum(0), out[6], *out[:6]
 
 
-_FLOW = Stage(_flow, _flow_adjoint, 8, keeps=True)
+_FLOW = KernelStage(_flow, _flow_adjoint, 8, keeps=True)

@@ -30,7 +30,7 @@ from caustic_cli.optics.kernels.fresnel import FRESNEL
 from caustic_cli.optics.kernels.grid import rows_at
 from caustic_cli.optics.kernels.ray_intersections import RayIntersections
 from caustic_cli.optics.kernels.splat import trimmed
-from caustic_cli.optics.kernels.stage import Stage
+from caustic_cli.optics.kernels.stage import KernelStage
 from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
 from caustic_cli.optics.kernels.threads import ALL
 from caustic_cli.optics.kernels.transfer import TargetPlane
@@ -356,7 +356,7 @@ def _adjoint(parameters: tuple, nets, _kept, by, _wanted):
     return [s[0] if apart else pixels.total(s) for s in sums]
 
 
-_IMAGE = Stage(_forward, _adjoint, 2)
+_IMAGE = KernelStage(_forward, _adjoint, 2)
 
 
 def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,7 @@ from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import total
 from caustic_cli.optics.kernels.rows import combine, spread
-from caustic_cli.optics.kernels.stage import Stage, empty
+from caustic_cli.optics.kernels.stage import KernelStage, empty
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
@@ -85,4 +85,4 @@ def _adjoint(rows: tuple[np.ndarray, np.ndarray, np.ndarray], inputs, _kept, by,
     return total(nets[0]), total(nets[2])
 
 
-_ROWS = Stage(_forward, _adjoint, 3)
+_ROWS = KernelStage(_forward, _adjoint, 3)

@@ -145,30 +145,12 @@ def _root(ray, start, limits, slope, c, pieces):
 
 
 @njit(entry=True, **FAST)
-def intersect(block, rays, start, limits, slopes, c, pieces, t, status, blocks):
-    """First intersections of rays (o_u, o_v, o_z, d_u, d_v, d_z), (N,) each, into t and status (N,).
-
-    limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,): estimates of t, infinite for none.
-    """
-    if on_threads(block, blocks, (rays, start, limits, slopes, c, pieces, t, status, blocks)):
-        return
-    ou, ov, oz, du, dv, dz = rays
-    count = len(ou)
-    for k in range(block * count // blocks, (block + 1) * count // blocks):
-        ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
-        slope = slopes[0] * abs(du[k]) + slopes[1] * abs(dv[k])
-        if start[k] == np.inf:
-            t[k], status[k] = 0.0, MISSED
-            continue
-        t[k], status[k] = _root(ray, start[k], limits, slope, c, pieces)
-
-
-@njit(entry=True, **FAST)
 def intersect_again(block, rays, side, limits, slopes, round_, step, halvings, most, c, pieces, t, blocks):
     """Next intersections of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `reintersection.reference`.
 
-    side: 1 above the surface, -1 under it; limits, slopes: as in `intersect`; round_: the surface ends at the circle inscribed
-    in its aperture; step, halvings, most: least step (mm), bisections of the last one and most steps.
+    side: 1 above the surface, -1 under it; limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; round_:
+    the surface ends at the circle inscribed in its aperture; step, halvings, most: least step (mm), bisections of the last one and
+    most steps.
     """
     if on_threads(block, blocks, (rays, side, limits, slopes, round_, step, halvings, most, c, pieces, t, blocks)):
         return

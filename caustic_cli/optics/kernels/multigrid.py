@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, cg
 
 from caustic_cli.optics.kernels.jit import njit
 
@@ -129,16 +130,7 @@ class Multigrid:
 
     def solve(self, r, tolerance, most=60):
         """x with |A x - r| <= tolerance |r|, by conjugate gradients of at most `most` steps; x (n,), steps taken."""
-        x, r = np.zeros_like(r), r.copy()
-        goal, p, rz = tolerance * np.linalg.norm(r), None, 0.0
-        for step in range(most):
-            if np.linalg.norm(r) <= goal:
-                return x, step
-            z = self.cycle(r)
-            old, rz = rz, r @ z
-            p = z if p is None else z + (rz / old) * p
-            q = self.levels[0].matrix @ p
-            alpha = rz / (p @ q)
-            x += alpha * p
-            r -= alpha * q
-        return x, most
+        steps = []
+        own = LinearOperator((len(r), len(r)), matvec=self.cycle, dtype=np.float64)
+        x, _ = cg(self.levels[0].matrix, r, rtol=tolerance, maxiter=most, M=own, callback=steps.append)
+        return x, len(steps)

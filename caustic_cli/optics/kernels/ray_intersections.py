@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.kernels import batches, blocks, intersect
+from caustic_cli.optics.kernels import batches, blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.stage import Stage
+from caustic_cli.optics.kernels.stage import KernelStage
 from caustic_cli.optics.kernels.surface import FusedSurface, sag_of, scaled
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
@@ -81,26 +81,19 @@ class RayIntersections:
     def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
         """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
 
-        start: estimates of the distances (N,), infinite for none; None if unknown.
+        start: as of `search`.
         """
-        if start is None:
-            c, hits = self.search(heights)
-            self.status, self.t = hits.status, np.maximum(hits.reach, 0.0)
-            return c
-        h = self._lower(heights)
-        c, pieces = self.surface.coefficients(h), self.surface.pieces
-        intersect.intersect(
-            ALL, self.rays, start, _limits(h), self.surface.slope_bounds(h), c, pieces, self.t, self.status, blocks()
-        )
-        x, y = ((o - 0.5 + self.t * d) / s for o, d, s in zip(self.rays[:2], self.rays[3:5], self.surface.scale, strict=True))
-        beyond = (x * x + y * y > self.radius**2) & (self.status == 0)  # the ray has left the lens
-        self.t[beyond], self.status[beyond] = 0.0, 1
+        c, hits = self.search(heights, start)
+        self.status, self.t = hits.status, np.maximum(hits.reach, 0.0)
         return c
 
-    def search(self, heights: Tensor) -> tuple[np.ndarray, batches.Hits]:
-        """Coefficients of the surface, counted from the heights' mean, and the first intersections."""
-        h = self._lower(heights)
-        return _first_hits(self.surface, h, _limits(h), self.rays, self.order, self.batched, self.radius)
+    def search(self, heights: Tensor, start: np.ndarray | None = None) -> tuple[np.ndarray, batches.Hits]:
+        """Coefficients of the surface, counted from the heights' mean, and the first intersections.
+
+        start: estimates of the distances (N,), infinite for none; None if unknown.
+        """
+        h, batched = self._lower(heights), self.batched and start is None
+        return _first_hits(self.surface, h, _limits(h), self.rays, self.order, batched, self.radius, start)
 
     def _lower(self, heights: Tensor) -> Tensor:
         """Heights less their mean, from which the rays then start."""
@@ -113,11 +106,11 @@ def _limits(h: Tensor) -> tuple[float, float]:
     return float(h.min()), float(h.max())
 
 
-def _first_hits(surface: FusedSurface, h: Tensor, limits, rays, order, batched: bool, radius: float):
+def _first_hits(surface: FusedSurface, h: Tensor, limits, rays, order, batched: bool, radius: float, start=None):
     """Coefficients, and the first intersections."""
     c, hits = surface.coefficients(h), batches.Hits.of(len(order))
-    slopes = surface.slope_bounds(h)
-    batches.first_hits(ALL, order, batched, rays, limits, slopes, float(radius), c, surface.pieces, hits, blocks())
+    slopes, begin = surface.slope_bounds(h), np.empty(0) if start is None else start
+    batches.first_hits(ALL, order, batched, rays, begin, limits, slopes, float(radius), c, surface.pieces, hits, blocks())
     return c, hits
 
 
@@ -185,4 +178,4 @@ def _adjoint(parameters: tuple[FusedSurface, RayIntersections | None], inputs, k
     return surface.pull(grads) if for_heights else None, *[*starts, *along][: len(ray)]
 
 
-_HITS = Stage(_forward, _adjoint, 3, keeps=True)
+_HITS = KernelStage(_forward, _adjoint, 3, keeps=True)

@@ -28,7 +28,7 @@ from caustic_cli.optics.kernels.arguments import ScreenFrame, Splat
 from caustic_cli.optics.kernels.filter_weights import pixel_weights
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits, total
-from caustic_cli.optics.kernels.stage import Stage, load, store
+from caustic_cli.optics.kernels.stage import KernelStage, load, store
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
@@ -249,4 +249,4 @@ def _adjoint(parameters: tuple[ScreenFrame, Splat], rays, _kept, by, wanted):
     return out
 
 
-_SPLAT = Stage(_forward, _adjoint, 2)
+_SPLAT = KernelStage(_forward, _adjoint, 2)

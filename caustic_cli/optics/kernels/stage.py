@@ -75,7 +75,7 @@ def _kernel(batch, rows: int):
     return kernel
 
 
-class Stage(NamedTuple):
+class KernelStage(NamedTuple):
     """A torch function of float64 arrays, differentiable once, in reverse mode, by its kernels.
 
     forward (parameters, *inputs): its results, of which the first `results` are differentiable.
@@ -98,7 +98,7 @@ class Stage(NamedTuple):
 
 class _Applied(torch.autograd.Function):
     @staticmethod
-    def forward(stage: Stage, parameters, *inputs):
+    def forward(stage: KernelStage, parameters, *inputs):
         return tuple(torch.from_numpy(np.asarray(a)) for a in stage.forward(parameters, *map(array, inputs)))
 
     @staticmethod
@@ -129,7 +129,7 @@ def empty(*shape: int) -> np.ndarray:
     return torch.empty(shape, dtype=torch.float64).numpy()
 
 
-def ray_stage(forward, adjoint, rows: int, outputs: int) -> Stage:
+def ray_stage(forward, adjoint, rows: int, outputs: int) -> KernelStage:
     """By batch functions: results (N,) of rays, each component a tensor (N,) or a number, and whether each goes on, (N,) bool.
 
     rows: of scratch that these use; outputs: number of results.
@@ -148,7 +148,7 @@ def ray_stage(forward, adjoint, rows: int, outputs: int) -> Stage:
         run_back(ALL, count, _components(ray), parameters, tuple(by), out, blocks())
         return out
 
-    return Stage(whole, back, outputs, kernels=(run, run_back))
+    return KernelStage(whole, back, outputs, kernels=(run, run_back))
 
 
 def _count(ray) -> int:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import batches, blocks, intersect, spline
-from caustic_cli.optics.kernels.stage import Stage, array
+from caustic_cli.optics.kernels.stage import KernelStage, array
 from caustic_cli.optics.kernels.threads import ALL
 
 #: Points per piece of the surface below which they are evaluated from the control heights instead of from all coefficients.
@@ -94,7 +94,7 @@ def _pull_scattered(parameters, _inputs, _kept, by, _wanted):
     return (surface.pull_at(u, v, *by),)
 
 
-_SCATTERED = Stage(lambda parameters, heights: parameters[0].evaluate(heights, *parameters[1:]), _pull_scattered, 3)
+_SCATTERED = KernelStage(lambda parameters, heights: parameters[0].evaluate(heights, *parameters[1:]), _pull_scattered, 3)
 
 
 def sag_of(heights: Tensor) -> tuple[Tensor, float]:
