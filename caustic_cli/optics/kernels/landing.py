@@ -42,10 +42,10 @@ def _cross(w, count, start, point):
     """u of a batch, by Newton steps from the paraxial value, from which they increase to the root."""
     h, n = point.distance, point.n
     for j in range(count):
-        w[U, j] = n / (n * h + w[Z, j] - start)
+        w[AT, j], w[U, j] = w[X, j] * w[X, j] + w[Y, j] * w[Y, j], n / (n * h + w[Z, j] - start)
     for _ in range(point.steps):
         for j in range(count):
-            q, z, u = w[X, j] * w[X, j] + w[Y, j] * w[Y, j], w[Z, j] - start, w[U, j]
+            q, z, u = w[AT, j], w[Z, j] - start, w[U, j]
             c, by_u = _slope(q, z, u, point)
             w[U, j] = u - (u * (h + z * c) - 1.0) / by_u
 
