@@ -163,7 +163,7 @@ DRAFT = Effort(
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
     sides=Refinement(3.0, 512, 64, 1_000_000, 8, ((1.0, 20),)),
     pairs=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 75),), large=LargePictures(256, 384)),
-    waves=((4, 12),),
+    waves=((5, 12),),
     wave_seconds=8.0,
 )
 STANDARD = Effort(

@@ -171,7 +171,7 @@ def test_a_coloured_target(capfd):
     figures = run(capfd, "design", "rgb.png", "--color", *TINY)
     project = Project.open("rgb.caustic")
     assert project.settings.source.wavelengths == tuple(RGB) and project.settings.lens.glass == "N-BK7"
-    light = powers(project.picture, project.scene().light).sum((1, 2))  # not R, G, B: what looks like them
+    light = powers(project.picture.irradiance(), project.scene().light).sum((1, 2))  # not R, G, B: what looks like them
     assert project.settings.source.weights == pytest.approx(list(light / light.sum()))
     assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-9)
     run(capfd, "render", "rgb.caustic", "--rays", "4000", "--npy", "out.npy", "-o", "out.png", "--quiet")
