@@ -72,7 +72,7 @@ class Work(NamedTuple):
 
 
 #: Seconds for a unit of each part on the reference machine.
-SECONDS = Work(6.68, 1.03, 0.0362, 0.0292, 0.0276, 0.018, 0.00574)
+SECONDS = Work(4.9, 1.03, 0.0362, 0.0292, 0.0276, 0.018, 0.00574)
 #: MiB for a unit of each part of `memory_of`.
 MIBS = (735.0, 233.0, 83.0)
 #: Error of designs of the smoothest pictures, by judge.
