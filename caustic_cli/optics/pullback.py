@@ -25,7 +25,7 @@ class _Contracted(torch.autograd.Function):
 def pull_back(outputs: Sequence[Tensor], inputs: Sequence[Tensor], by: Sequence[Tensor]) -> tuple[Any, ...]:
     """Derivatives by `inputs` from those `by` the outputs, of their shapes; None where no output depends on an input.
 
-    As `torch.autograd.grad` with `grad_outputs`, for which torch 2.11 first loads SymPy: 0.4 s of a design.
+    As `torch.autograd.grad` with `grad_outputs`, for which torch 2.13 first loads SymPy: 0.4 s of a design.
     """
     with torch.enable_grad():  # also within the derivative of another function
         whole = _Contracted.apply(list(by), *outputs)
