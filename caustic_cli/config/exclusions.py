@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
-from caustic_cli.optics.waves.unsupported import WAVE_REFINEMENT, WAVES_BY_DEFAULT
+from caustic_cli.optics.waves.unsupported import WAVES_BY_DEFAULT
 from caustic_cli.scene.elements import NOT_BESIDE
 from caustic_cli.scene.traits import TRAITS, Capability
 from caustic_cli.schema.table import TABLE, default
@@ -109,7 +109,6 @@ EXCLUDED_LATER: dict[str, dict[str, str]] = {
     "lens.array": dict.fromkeys(("design.start offset", "design.network", "design.optimizer"), _LENSLETS),
     "design.waves on": {
         "design.network": "⟨design.waves⟩ on needs network none: the wave image is refined by control heights",
-        **_by_settings(WAVE_REFINEMENT),
     },
     "design.waves auto": {
         **_by_settings(WAVES_BY_DEFAULT),

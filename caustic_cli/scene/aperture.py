@@ -37,9 +37,11 @@ class Aperture:
     #: Half widths, mm.
     half_size: tuple[float, float] = (math.inf, math.inf)
 
-    #: Its name among the settings; whether it is a circle, and whether compiled loops, which take no objects, know it.
+    #: Its name among the settings; whether it is a circle, an opaque mask with holes, and whether compiled loops, which take no
+    #: objects, know it.
     name: ClassVar[str] = "rectangle"
     round: ClassVar[bool] = False
+    masks: ClassVar[bool] = False
     compiled: ClassVar[bool] = True
 
     @property

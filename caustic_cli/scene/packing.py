@@ -126,6 +126,7 @@ class RoundLenslets(PartAperture):
     cells: Cells | None = None
 
     name: ClassVar[str] = "round lenslets"
+    masks: ClassVar[bool] = True
 
     @property
     def area(self) -> float:

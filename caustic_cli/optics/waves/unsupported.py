@@ -19,18 +19,11 @@ class NoWaveImage(CausticError):
 #: Why a scene has no wave image, as clauses.
 WAVE_IMAGE = Capability(
     "wave image",
-    {
-        **dict.fromkeys(("ray file", "ray file among sources"), "a ray file contains no phase"),
-    },
+    dict.fromkeys(("ray file", "ray file among sources"), "a ray file contains no phase"),
 )
 WAVE_REFINEMENT = Capability(
     "design by waves",
-    {
-        **dict.fromkeys(
-            ("ray file", "ray file among sources"),
-            "⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine",
-        ),
-    },
+    {trait: f"⟨design.waves⟩ on: {why}, so that it has no wave image to refine" for trait, why in WAVE_IMAGE.unsupported.items()},
 )
 WAVES_BY_DEFAULT = Capability(
     "design by waves unless asked for",

@@ -50,7 +50,6 @@ from caustic_cli.optics.waves.interpolation import FineWavefront, Lit, extrapola
 from caustic_cli.optics.waves.ray_aiming import aimed_rays
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Pupil
-from caustic_cli.scene.packing import RoundLenslets
 from caustic_cli.scene.screen import passed_by
 
 interpolate_nd = OnDemand("scipy.interpolate")
@@ -148,9 +147,9 @@ class Optics:
         return replace(self, distance=imaged.distance, imaged=imaged)
 
     @cached_property
-    def unmasked(self) -> tuple[System, RoundLenslets | None]:
+    def unmasked(self) -> tuple[System, Any]:
         """The system without a mask on its exit, through which rays are traced, and the mask, None if there is none."""
-        masks = [e.aperture for e in self.system.elements if e.name == EXIT and isinstance(e.aperture, RoundLenslets)]
+        masks = [e.aperture for e in self.system.elements if e.name == EXIT and e.aperture.masks]
         if not masks:
             return self.system, None
         clear = self.system.pupil.aperture
