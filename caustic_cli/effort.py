@@ -94,7 +94,8 @@ class Effort:
     #: The same for two pictures, which the initial surfaces pair to first order in the angles only: many iterations on a net and
     #: with rays for which they are cheap.
     pairs: Refinement
-    #: (wavelengths of white light, iterations) of each stage on the wave image: the first ones need few.
+    #: (wavelengths of white light, iterations) of each stage on the wave image: the first lenses are blurred, and so alike at all
+    #: wavelengths.  At least 2 nm from those of the verdict.
     waves: tuple[tuple[int, int], ...]
     #: Time for them with `waves = "auto"`, s on two cores.
     wave_seconds: float
@@ -163,7 +164,7 @@ DRAFT = Effort(
     creased=Refinement(6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),), 1152),
     sides=Refinement(3.0, 512, 64, 1_000_000, 8, ((1.0, 20),)),
     pairs=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 75),), large=LargePictures(256, 384)),
-    waves=((5, 12),),
+    waves=((2, 12),),
     wave_seconds=8.0,
 )
 STANDARD = Effort(
@@ -176,7 +177,7 @@ STANDARD = Effort(
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     sides=Refinement(3.0, 765, 64, 4_000_000, 8, ((1.0, 20),)),
     pairs=Refinement(1.5, 765, 32, 4_000_000, 4, ((0.5, 60), (1.0, 90))),
-    waves=((5, 20), (6, 20)),
+    waves=((2, 10), (4, 10), (6, 20)),
     wave_seconds=25.0,
 )
 FINE = Effort(
@@ -186,7 +187,7 @@ FINE = Effort(
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     sides=Refinement(4.0, 1021, 64, 4_000_000, 8, ((1.0, 60),)),
     pairs=Refinement(2.0, 1021, 64, 4_000_000, 6, ((0.25, 100), (1.0, 60))),
-    waves=((5, 12), (6, 12), (8, 40)),
+    waves=((2, 12), (4, 12), (8, 40)),
     wave_seconds=90.0,
 )
 TEST = replace(

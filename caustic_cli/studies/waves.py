@@ -27,7 +27,7 @@ FINER = 1.25
 #: Wavelengths relative to a spectral line, for the sensitivity to the wavelength.
 ASIDE = (0.99, 1.01)
 #: Wavelengths of a continuous spectrum for a fast error: how many, least distance from those of the design, nm, and numbers tried.
-FEW, APART, TRIED = 7, 2.0, 6
+FEW, APART, TRIED = 5, 2.0, 6
 #: Figures of a ray image that a wave image has as well.
 _SAME = ("relative_rms", "psnr_db", "ssim", "on_target", "in_black", "on_screen")
 
