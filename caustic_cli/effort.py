@@ -177,7 +177,7 @@ STANDARD = Effort(
     creased=Refinement(12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     sides=Refinement(3.0, 765, 64, 4_000_000, 8, ((1.0, 20),)),
     pairs=Refinement(1.5, 765, 32, 4_000_000, 4, ((0.5, 60), (1.0, 90))),
-    waves=((2, 10), (4, 10), (6, 20)),
+    waves=((2, 24), (6, 20)),
     wave_seconds=25.0,
 )
 FINE = Effort(
@@ -187,7 +187,7 @@ FINE = Effort(
     creased=Refinement(16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),), 1152),
     sides=Refinement(4.0, 1021, 64, 4_000_000, 8, ((1.0, 60),)),
     pairs=Refinement(2.0, 1021, 64, 4_000_000, 6, ((0.25, 100), (1.0, 60))),
-    waves=((2, 12), (4, 12), (8, 40)),
+    waves=((2, 12), (6, 12), (8, 40)),
     wave_seconds=90.0,
 )
 TEST = replace(
