@@ -6,7 +6,6 @@ iteration depends on, and every random number is a function of the seed and the 
 
 from __future__ import annotations
 
-import gc
 import math
 import time
 from collections.abc import Callable
@@ -193,7 +192,6 @@ class Designer:
             if not done or k == last:
                 break
             state = self._next(state, k + 1)
-            gc.collect()  # optimiser and objective refer to each other, and hold the memory that the next stage needs
         return state
 
     def _clock(self) -> float:

@@ -6,7 +6,9 @@ Both evaluate a step before accepting it, and reject one that leads to a loss th
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -118,7 +120,12 @@ class QuasiNewton:
         self.seen: dict[float, tuple[float, Tensor]] = {}
         self.image: Tensor | None = None
         self.rejected = 0
-        self.method = LBFGS(self._evaluate, self.parameter.detach().reshape(-1).clone())
+        here = weakref.ref(self)  # else each would hold the other, and the memory of the objective
+
+        def evaluate(x: Tensor) -> tuple[float, Tensor]:
+            return cast(QuasiNewton, here())._evaluate(x)
+
+        self.method = LBFGS(evaluate, self.parameter.detach().reshape(-1).clone())
         self.loss, self.on_screen = math.inf, 0.0
 
     def _evaluate(self, x: Tensor) -> tuple[float, Tensor]:
