@@ -64,9 +64,9 @@ def _raised_cosine(phi, v, out, slope, scratch):
     _scaled(theta, phi, v, scratch)
     for k in range(v):  # cos(theta (k - r + q)) by addition
         c, s = math.cos(theta * (k - (v - 1) // 2)), math.sin(theta * (k - (v - 1) // 2))
-        _mix(1.0 / v, c, -s, scratch[0], scratch[1], out[k])
+        _mix(1.0 / v, c, -s, scratch[0], scratch[1], out[k][: len(phi)])
         if len(slope):
-            _mix(0.0, theta * s, theta * c, scratch[0], scratch[1], slope[k])
+            _mix(0.0, theta * s, theta * c, scratch[0], scratch[1], slope[k][: len(phi)])
 
 
 @njit(**FAST)
@@ -103,7 +103,7 @@ def _series_slope(phi, offset, alpha, out):
 def _recursion(phi, v, alpha, out, slope, scratch):
     """Shares over exp(-alpha q^2): exp(-alpha (d^2 - q^2)) follows from pixel to pixel."""
     r = (v - 1) // 2
-    edge, up, down, rise, fall = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    edge, up, down, rise, fall = scratch[0], scratch[1], scratch[2], scratch[3][: len(phi)], scratch[4][: len(phi)]
     least = math.exp(-0.25 * alpha * v * v)
     for j in range(len(phi)):
         edge[j] = least * _exp(alpha * (0.5 - phi[j]) * (0.5 - phi[j]))
@@ -130,13 +130,13 @@ def _recursion(phi, v, alpha, out, slope, scratch):
 
 @njit(**FAST)
 def _above(value, edge, out):
-    for j in range(len(out)):
+    for j in range(len(value)):
         out[j] = max(value[j] - edge[j], 0.0)
 
 
 @njit(**FAST)
 def _lean(phi, k, alpha, value, out):
-    for j in range(len(out)):
+    for j in range(len(phi)):
         out[j] = 2.0 * alpha * (0.5 - phi[j] + k) * value[j]
 
 
@@ -169,26 +169,26 @@ def _sum(rows, out):
 
 @njit(inline="always", **FAST)
 def _level(value, over, lean, slope):
-    for j in range(len(slope)):
+    for j in range(len(over)):
         slope[j] -= value[j] * over[j] * lean[j]
 
 
 @njit(**FAST)
 def pixel_weights(kind, v, alpha, phi, out, slope, over, lean, scratch):
-    """Weights of rays at sub-pixel positions phi (b,), up to normalisation: out (v, b), the weight is out * over.
+    """Weights of rays at sub-pixel positions phi (b,), up to normalisation: out (v, at least b), the weight is out * over.
 
     Unless `slope` is empty, their derivatives by phi are (slope - out * lean) * over.  The normalisation by `over` is left to the
     caller, which needs one product per ray instead of one per pixel.
 
-    scratch: (5, b).
+    scratch: (5, at least b).
     """
     over[:] = 1.0
     if len(slope):
         lean[:] = 0.0
     if v == 1:
-        out[0] = 1.0
+        out[0][: len(phi)] = 1.0
         if len(slope):
-            slope[0] = 0.0
+            slope[0][: len(phi)] = 0.0
         return
     if kind == COSINE:
         _raised_cosine(phi, v, out, slope, scratch)

@@ -29,6 +29,7 @@ from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.fresnel import FRESNEL
 from caustic_cli.optics.kernels.grid import rows_at
 from caustic_cli.optics.kernels.ray_intersections import RayIntersections
+from caustic_cli.optics.kernels.rows import WIDE, room
 from caustic_cli.optics.kernels.splat import trimmed
 from caustic_cli.optics.kernels.stage import KernelStage
 from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
@@ -57,10 +58,6 @@ class _Workspace:
         if array is None or array.shape != shape:
             array = self.arrays[name] = np.zeros(shape)
         return array
-
-
-#: Length of the rows in which scattered rays are passed to the kernel.
-ROW = 1024
 
 
 class PlaneKernel:
@@ -291,7 +288,7 @@ def _arguments(
 
 def _layout(count: int) -> tuple[int, int]:
     """Rows and columns for so many scattered rays: at least two rows, since a single one is always contiguous, see `_strided`."""
-    rows = max(2, -(-count // ROW))
+    rows = max(2, -(-count // WIDE))
     return rows, -(-count // rows)
 
 
@@ -310,7 +307,7 @@ _NONE = _strided(np.zeros((2, 2)))
 
 def compile_surface() -> None:
     """Compile the evaluation of the surface at rays of a plane wave, and its adjoint."""
-    space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, ROW, dtype=torch.float64)
+    space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, WIDE, dtype=torch.float64)
     heights = torch.zeros(4, 4, dtype=torch.float64, requires_grad=True)
     net, slope = AlongV(space, at, 0.5)(heights)
     found = scattered_surface(FusedSurface((space, space), (1.0, 1.0)), heights, at.numpy(), at.numpy())
@@ -325,7 +322,8 @@ def compile_splat() -> None:
 def compile_adjoint() -> None:
     """Compile the adjoint of the kernel of `compile_splat`."""
     parameters, *nets = _example()
-    image = np.zeros(_images(*parameters[2:])[0].shape[1:])
+    _, _, frame, splat, *_ = parameters[2]
+    image = np.zeros(splat.padded(frame))
     _adjoint(parameters, [t.numpy() for t in nets], (), (image, 1.0), (True, True, True))
 
 
@@ -341,30 +339,24 @@ def _example() -> tuple:
 def _forward(parameters: tuple, *nets):
     """Padded image, power behind the lens (), ledger, from nets (n, b)."""
     rows, _, arguments, workspace = parameters
-    images, scratch = _images(arguments, workspace)
+    _, _, frame, splat, *_ = arguments
+    images = workspace("images", blocks(), *splat.padded(frame))
     ledgers = np.empty((len(images), fused.COLUMNS))
-    fused.forward(ALL, images, ledgers, scratch, RowsOfSurface(*rows, *nets), *arguments)
+    fused.forward(ALL, images, ledgers, workspace("scratch", *room(splat, len(images))), RowsOfSurface(*rows, *nets), *arguments)
     ledger = ledgers.sum(0)
     return pixels.total(images), ledger[fused.LEAVING], ledger
 
 
 def _adjoint(parameters: tuple, nets, _kept, by, _wanted):
     rows, apart, arguments, workspace = parameters
-    scratch, shape = _images(arguments, workspace)[1], nets[0].shape
-    sums = np.empty((3, 1, *shape)) if apart else workspace("nets", 3, len(scratch), *shape)
+    count, shape = blocks(), nets[0].shape
+    sums = np.empty((3, 1, *shape)) if apart else workspace("nets", 3, count, *shape)
+    scratch = workspace("scratch", *room(arguments[3], count))
     fused.backward(ALL, by[0], float(by[1]), apart, sums, scratch, RowsOfSurface(*rows, *nets), *arguments)
     return [s[0] if apart else pixels.total(s) for s in sums]
 
 
 _IMAGE = KernelStage(_forward, _adjoint, 2)
-
-
-def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
-    """Images and scratch of all blocks, to be overwritten."""
-    rays, _, frame, splat, *_ = arguments
-    count = blocks()
-    images = workspace("images", count, *splat.padded(frame))
-    return images, workspace("scratch", count, fused.scratch_rows(splat), rays.x.shape[1])
 
 
 def scattered_points(keys, salts, start: int, stop: int, nu: int, nv: int, stratified: bool) -> tuple[Tensor, Tensor]:

@@ -58,7 +58,7 @@ def _combine(block, surface, z, zx, zy, blocks):
     if on_threads(block, blocks, (surface, z, zx, zy, blocks)):
         return
     for i in range(block * len(z) // blocks, (block + 1) * len(z) // blocks):
-        combine(i, surface, z[i], zx[i], zy[i])
+        combine(i, 0, surface, z[i], zx[i], zy[i])
 
 
 @njit(entry=True, **FAST)
@@ -69,7 +69,7 @@ def _spread(block, by_z, by_zx, by_zy, surface, nets):
         return
     nets[:, block] = 0.0
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        spread(i, surface, by_z[i], by_zx[i], by_zy[i], nets[:, block], False)
+        spread(i, 0, surface, by_z[i], by_zx[i], by_zy[i], nets[:, block], False)
 
 
 def _forward(rows: tuple[np.ndarray, np.ndarray, np.ndarray], net, net_y):

@@ -45,43 +45,45 @@ class Interface(NamedTuple):
     polarised: bool
 
 
+# side is sigma, and mirror whether the surface reflects: callers that know them give constants, which the compiler folds.
+
+
 @njit(inline="always", **FAST)
-def _meet(dx, dy, dz, long2, gx, gy, eta):
-    """|N|^2, c, sigma, s, whether light passes, |gamma|, and one over its denominator."""
-    norm2, along = 1.0 + gx * gx + gy * gy, dz - dx * gx - dy * gy
-    c = abs(along)
+def _meet(dx, dy, dz, long2, gx, gy, eta, side, mirror):
+    """|N|^2, c, s, whether light passes, |gamma|, and one over its denominator."""
+    norm2, c = 1.0 + gx * gx + gy * gy, side * (dz - dx * gx - dy * gy)
     s, passes = cosine_behind(norm2 * long2, c, eta)
-    under = 1.0 / (norm2 if eta < 0.0 else s + eta * c)
-    gamma = (2.0 * c if eta < 0.0 else (1.0 - eta) * (1.0 + eta) * long2) * under
-    return norm2, c, math.copysign(1.0, along), s, passes, gamma, under
+    under = 1.0 / (norm2 if mirror else s + eta * c)
+    gamma = (2.0 * c if mirror else (1.0 - eta) * (1.0 + eta) * long2) * under
+    return norm2, c, s, passes, gamma, under
 
 
 @njit(inline="always", **FAST)
-def bend(dx, dy, dz, long2, gx, gy, f, eta, fresnel):
+def bend(dx, dy, dz, long2, gx, gy, f, eta, fresnel, side, mirror):
     """t, 1 - R and whether light passes, of one ray; long2: |d|^2."""
-    norm2, c, side, s, passes, gamma, _ = _meet(dx, dy, dz, long2, gx, gy, eta)
+    norm2, c, s, passes, gamma, _ = _meet(dx, dy, dz, long2, gx, gy, eta, side, mirror)
     r, _, _, _, _ = reflectance(fresnel, eta, norm2 * long2, c, s, f)
-    n, gamma = abs(eta), math.copysign(1.0, eta) * side * gamma
+    n, gamma = -eta if mirror else eta, (-side if mirror else side) * gamma
     return n * dx - gamma * gx, n * dy - gamma * gy, n * dz + gamma, 1.0 - r, passes
 
 
 @njit(inline="always", **FAST)
-def pull(dx, dy, dz, long2, gx, gy, f, power, eta, fresnel, tx, ty, tz, by_after):
+def pull(dx, dy, dz, long2, gx, gy, f, power, eta, fresnel, side, mirror, tx, ty, tz, by_after):
     """Adjoint of `bend`: derivatives by d, g, P, f and |d|^2 of one ray, from those by t and P'."""
-    norm2, c, side, s, passes, gamma, under = _meet(dx, dy, dz, long2, gx, gy, eta)
+    norm2, c, s, passes, gamma, under = _meet(dx, dy, dz, long2, gx, gy, eta, side, mirror)
     r, r_c, r_s, r_both, r_f = reflectance(fresnel, eta, norm2 * long2, c, s, f)
     # P'
     by_after = by_after if passes else 0.0
     by_r = -power * by_after
     # t
-    n, toward = abs(eta), math.copysign(1.0, eta) * side
+    n, toward = (-eta, -side) if mirror else (eta, side)
     by_gamma = toward * (tz - gx * tx - gy * ty) * under
     toward *= gamma
     # gamma, R and s
-    bent = 0.0 if eta < 0.0 else by_gamma
+    bent = 0.0 if mirror else by_gamma
     by_radicand = 0.5 * (by_r * r_s - gamma * bent) / s if passes else 0.0
     by_both = by_r * r_both + by_radicand * (1.0 - eta) * (1.0 + eta)
-    by_c = by_r * r_c + 2.0 * eta * eta * by_radicand * c + (2.0 * by_gamma if eta < 0.0 else -eta * gamma * by_gamma)
+    by_c = by_r * r_c + 2.0 * eta * eta * by_radicand * c + (2.0 * by_gamma if mirror else -eta * gamma * by_gamma)
     # c and |N|^2
     by_along, by_norm2 = side * by_c, by_both * long2 - gamma * (by_gamma - bent)
     by_gx, by_gy = 2.0 * gx * by_norm2 - by_along * dx - toward * tx, 2.0 * gy * by_norm2 - by_along * dy - toward * ty
@@ -142,7 +144,8 @@ def _refract(v, start, count, ray, surface, _given, out):
     _part(v, count, surface.polarised)
     for j in range(count):
         d_x, d_y, d_z, g_x, g_y, f = v[DX, j], v[DY, j], v[DZ, j], v[GX, j], v[GY, j], v[F, j]
-        tx, ty, tz, kept, passing = bend(d_x, d_y, d_z, 1.0, g_x, g_y, f, surface.eta, surface.fresnel)
+        side = math.copysign(1.0, d_z - d_x * g_x - d_y * g_y)
+        tx, ty, tz, kept, passing = bend(d_x, d_y, d_z, 1.0, g_x, g_y, f, surface.eta, surface.fresnel, side, False)
         v[TX, j], v[TY, j], v[TZ, j] = tx, ty, tz
         v[AFTER, j], v[PASSES, j] = v[P, j] * kept if passing else 0.0, 1.0 if passing else 0.0
     for i in range(4):
@@ -160,8 +163,9 @@ def _refract_adjoint(v, start, count, ray, surface, given, out):
     _part(v, count, surface.polarised)
     for j in range(count):
         d_x, d_y, d_z, g_x, g_y, f, power = v[DX, j], v[DY, j], v[DZ, j], v[GX, j], v[GY, j], v[F, j], v[P, j]
+        side = math.copysign(1.0, d_z - d_x * g_x - d_y * g_y)
         by_dx, by_dy, by_dz, by_gx, by_gy, by_p, by_f, _ = pull(
-            d_x, d_y, d_z, 1.0, g_x, g_y, f, power, eta, fresnel, v[TX, j], v[TY, j], v[TZ, j], v[AFTER, j]
+            d_x, d_y, d_z, 1.0, g_x, g_y, f, power, eta, fresnel, side, False, v[TX, j], v[TY, j], v[TZ, j], v[AFTER, j]
         )
         v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j], v[BY_GX, j], v[BY_GY, j] = by_dx, by_dy, by_dz, by_gx, by_gy
         v[BY_P, j], v[BY_F, j] = by_p, by_f

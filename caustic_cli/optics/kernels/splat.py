@@ -33,25 +33,25 @@ from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
-#: Rays in a row.
-ROW = 512
-
 
 @njit(**FAST)
 def _fraction(p, out):
-    for j in range(len(p)):
+    for j in range(len(out)):
         out[j] = p[j] - math.floor(p[j])
 
 
 @njit(inline="always", **FAST)
-def share(v, splat, sx, sy, dx, dy):
-    """Filter weights of one row's rays, and their derivatives unless dx and dy are empty."""
+def share(v, count, splat, sx, sy, dx, dy):
+    """Filter weights of a batch's rays, and their derivatives unless dx and dy are empty."""
+    phi = v[row.PHI][:count]
     if splat.size_x > 1:
-        _fraction(v[row.PX], v[row.PHI])
-    pixel_weights(splat.kind, splat.size_x, splat.alpha_x, v[row.PHI], sx, dx, v[row.OVER_X], v[row.LEAN_X], v[row.VECTORS :])
+        _fraction(v[row.PX], phi)
+    over, lean = v[row.OVER_X][:count], v[row.LEAN_X][:count]
+    pixel_weights(splat.kind, splat.size_x, splat.alpha_x, phi, sx, dx, over, lean, v[row.VECTORS :])
     if splat.size_y > 1:
-        _fraction(v[row.PY], v[row.PHI])
-    pixel_weights(splat.kind, splat.size_y, splat.alpha_y, v[row.PHI], sy, dy, v[row.OVER_Y], v[row.LEAN_Y], v[row.VECTORS :])
+        _fraction(v[row.PY], phi)
+    over, lean = v[row.OVER_Y][:count], v[row.LEAN_Y][:count]
+    pixel_weights(splat.kind, splat.size_y, splat.alpha_y, phi, sy, dy, over, lean, v[row.VECTORS :])
 
 
 @njit(**FAST)
@@ -179,15 +179,6 @@ def trimmed(padded: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Ten
 
 
 @njit(**FAST)
-def _cut(splat):
-    """A block's scratch: vectors, filter weights along x and y, their slopes; a column of each, in steps of four."""
-    v = np.zeros((row.VECTORS + row.SCRATCH, ROW))
-    vx, vy = splat.size_x, splat.size_y
-    long = vy + -vy % 4
-    return v, np.empty((vx, ROW)), np.empty((vy, ROW)), np.empty((vx, ROW)), np.empty((vy, ROW)), np.zeros(long), np.zeros(long)
-
-
-@njit(**FAST)
 def _pixels(x, low, wide, count, out):
     for j in range(count):
         out[j] = (x[j] - low) / wide
@@ -204,48 +195,48 @@ def aim(x, y, weight, start, count, frame, v):
 
 
 @njit(entry=True, **FAST)
-def _splat(block, x, y, weight, frame, splat, images, outside):
+def _splat(block, x, y, weight, frame, splat, scratch, images, outside):
     """Blocks' images, whose `total` is the padded one, and weights outside (blocks,): both are overwritten."""
-    rows, blocks = -(-len(x) // ROW), len(images)
-    if on_threads(block, blocks, (x, y, weight, frame, splat, images, outside)):
+    rows, blocks = -(-len(x) // row.WIDE), len(images)
+    if on_threads(block, blocks, (x, y, weight, frame, splat, scratch, images, outside)):
         return
     images[block], outside[block] = 0.0, 0.0
-    v, sx, sy, dx, dy, column, _ = _cut(splat)
+    v, sx, sy, dx, dy, column, _ = row.cut(scratch[block], splat)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        count = min(ROW, len(x) - i * ROW)
-        aim(x, y, weight, i * ROW, count, frame, v)
-        share(v, splat, sx, sy, dx[:0], dy[:0])
+        count = min(row.WIDE, len(x) - i * row.WIDE)
+        aim(x, y, weight, i * row.WIDE, count, frame, v)
+        share(v, count, splat, sx, sy, dx[:0], dy[:0])
         outside[block] += scatter(v, count, frame, splat, sx, sy, images[block], column)
 
 
 @njit(entry=True, **FAST)
-def _splat_adjoint(block, x, y, weight, frame, splat, grad, by_outside, out, blocks):
+def _splat_adjoint(block, x, y, weight, frame, splat, scratch, grad, by_outside, out):
     """Derivatives by x, y and weight into `out`, from those by the padded image and the weight outside."""
-    if on_threads(block, blocks, (x, y, weight, frame, splat, grad, by_outside, out, blocks)):
+    if on_threads(block, len(scratch), (x, y, weight, frame, splat, scratch, grad, by_outside, out)):
         return
-    rows = -(-len(x) // ROW)
-    v, sx, sy, dx, dy, column, tilt = _cut(splat)
+    rows, blocks = -(-len(x) // row.WIDE), len(scratch)
+    v, sx, sy, dx, dy, column, tilt = row.cut(scratch[block], splat)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        count = min(ROW, len(x) - i * ROW)
-        aim(x, y, weight, i * ROW, count, frame, v)
-        share(v, splat, sx, sy, dx, dy)
+        count = min(row.WIDE, len(x) - i * row.WIDE)
+        aim(x, y, weight, i * row.WIDE, count, frame, v)
+        share(v, count, splat, sx, sy, dx, dy)
         gather(v, count, frame, splat, sx, sy, dx, dy, grad, 0.0, by_outside, column, tilt)
-        store(v[row.BY_PX], i * ROW, count, out[0])
-        store(v[row.BY_PY], i * ROW, count, out[1])
-        store(v[row.BY_POWER], i * ROW, count, out[2])
+        store(v[row.BY_PX], i * row.WIDE, count, out[0])
+        store(v[row.BY_PY], i * row.WIDE, count, out[1])
+        store(v[row.BY_POWER], i * row.WIDE, count, out[2])
 
 
 def _forward(parameters: tuple[ScreenFrame, Splat], x, y, weight):
     """Padded image, the weight outside ()."""
     frame, splat = parameters
     images, outside = np.empty((blocks(), *splat.padded(frame))), np.empty(blocks())
-    _splat(ALL, x, y, weight, frame, splat, images, outside)
+    _splat(ALL, x, y, weight, frame, splat, np.empty(row.room(splat, len(images))), images, outside)
     return total(images), outside.sum()
 
 
 def _adjoint(parameters: tuple[ScreenFrame, Splat], rays, _kept, by, wanted):
     out = tuple(np.empty(len(rays[0]) if w else 0) for w in wanted)
-    _splat_adjoint(ALL, *rays, *parameters, by[0], float(by[1]), out, blocks())
+    _splat_adjoint(ALL, *rays, *parameters, np.empty(row.room(parameters[1], blocks())), by[0], float(by[1]), out)
     return out
 
 
