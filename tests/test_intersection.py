@@ -51,8 +51,8 @@ def fan(count, widest, seed=0, half=(5.0, 4.0), z=0.0):
 
 def find_fused(f, heights, rays, start=None):
     hits = RayIntersections(FusedSurface(f.spaces, f.half_size), rays.origin, rays.direction, None)
-    hits.find(heights, start)
-    return torch.from_numpy(hits.t.copy()), torch.from_numpy(hits.status.astype(np.int64))
+    t, status = hits.find(heights, start)
+    return torch.from_numpy(t), torch.from_numpy(status.astype(np.int64))
 
 
 def find_plainly(f, heights, rays):

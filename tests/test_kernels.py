@@ -245,9 +245,9 @@ def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
     for part in ahead.PARTS:
         ahead.compile_part(part)
     kernels = [fused.forward, fused.backward, pixels.sums, spline.evaluate, spline.pull_back, banded._contract, banded._spread]
-    kernels += [spline.evaluate_net, spline.pull_coefficients, refraction.REFRACT.kernels[0], random_points.scatter]
+    kernels += [spline.pull_coefficients, refraction.REFRACT.kernels[0], random_points.scatter]
     kernels += [multigrid.aggregate, multigrid.sweep]
-    kernels += [getattr(fields, name) for name in ("reduce_phase", "make_field", "on_pixels", "widen", "weigh", "make_pull")]
+    kernels += [getattr(fields, name) for name in ("make_field", "on_pixels", "widen", "weigh", "make_pull")]
     by_degree = [fields.displace, fields.pull_displacement]  # compiled for each, ahead for cubics
     names = {f"{k.__module__.rpartition('.')[2]}.{k.__name__}" for k in kernels + by_degree}
     assert {name for name, _ in ahead.PARTS.values()} <= names

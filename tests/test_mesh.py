@@ -19,7 +19,7 @@ from parametric import Surface
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import mesh as kernel
-from caustic_cli.optics.mesh import TriangleMesh, boxes_of, vertices_of
+from caustic_cli.optics.mesh import TriangleMesh, boxes_of, search, vertices_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 UNEVEN = torch.tensor([0, 0, 0, 0, 0.3, 0.3, 0.55, 0.55, 0.55, 0.9, 1, 1, 1, 1], dtype=torch.float64)
@@ -104,7 +104,7 @@ def on_vertices(xs, ys, z, rays, n=(1, 1), recursive=True, blocks=1):
             part = z[i * n[0] : (i + 1) * n[0] + 1, j * n[1] : (j + 1) * n[1] + 1]
             low[i, j], high[i, j] = part.min() - 1e-13, part.max() + 1e-13
     xs, ys = np.ascontiguousarray(xs), np.ascontiguousarray(ys)  # another layout would compile the kernel again
-    return kernel.intersect(*np.ascontiguousarray(rays), xs, ys, *n, z, low, high, recursive, blocks)
+    return search(np.ascontiguousarray(rays), (xs, ys), n, z, low, high, recursive, blocks)
 
 
 def wide(rng: np.random.Generator, count: int, half=HALF) -> np.ndarray:
@@ -142,7 +142,7 @@ def test_flat_recursive_and_any_number_of_blocks_give_the_same_bits(name):
     assert 2000 < (flat[1] == kernel.HIT).sum() < 18_000
     assert flat[2].max() > 10
     for blocks in (1, 2, 3, 7):
-        other = kernel.intersect(*rays, *mesh._breaks, *mesh.shape, mesh._vertices, mesh._low, mesh._high, True, blocks)
+        other = search(rays, mesh._breaks, mesh.shape, mesh._vertices, mesh._low, mesh._high, True, blocks)
         for a, b in zip(flat, other, strict=True):
             assert (a == b).all()
 

@@ -7,9 +7,9 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse import surface_from_map, transport
+from caustic_cli.inverse.multigrid import Multigrid
 from caustic_cli.inverse.scattered import Pixels, Scattered
 from caustic_cli.optics.kernels import laguerre
-from caustic_cli.optics.kernels.multigrid import Multigrid
 
 A, B, C, D = 5.0, 4.0, 15.0, 9.0
 

@@ -38,11 +38,11 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from caustic_cli.errors import InputError
+from caustic_cli.inverse import multigrid
 from caustic_cli.loading import OnDemand
 
 #: Compiled on first use.
 kernels, laguerre = OnDemand("caustic_cli.optics.kernels"), OnDemand("caustic_cli.optics.kernels.laguerre")
-multigrid = OnDemand("caustic_cli.optics.kernels.multigrid")
 
 FINE = 4  # raster points per source cell along each axis, over which phi is averaged
 #: The same for Newton's method: cells of sites along a line are long and narrow, and one between the points of the raster appears
@@ -589,5 +589,5 @@ def _smoothed(psi, sites: _Sites, shape, half, smooth: float) -> np.ndarray:
         count = min(STRIP, m + 1 - j)
         at = low + FINE * j
         phi, site = envelope.on(x1, x2[at : at + FINE * (count - 1) + len(kernel)])
-        laguerre.averages(phi, site, sites.y1, sites.y2, kernel, FINE, low, out[:, :, j : j + count])
+        laguerre.averages(laguerre.ALL, phi, site, sites.y1, sites.y2, kernel, FINE, low, out[:, :, j : j + count])
     return out

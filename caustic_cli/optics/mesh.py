@@ -5,6 +5,7 @@ The search is in `kernels.mesh`.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,6 +41,37 @@ def boxes_of(space_u: SplineSpace, space_v: SplineSpace, heights: Tensor) -> tup
     return low - pad, high + pad
 
 
+def lines_of(breaks: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Grid lines that divide spans into n parts, and one over the widths of the cells above them."""
+    inner = breaks[:-1, None] + np.diff(breaks)[:, None] * (np.arange(n) / n)
+    lines = np.append(inner, breaks[-1])
+    return lines, 1.0 / np.diff(lines)
+
+
+def pyramid_of(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest of 2^l x 2^l boxes, up to a single one: tree (., 2), and of each level l its beginning there and its
+    columns."""
+    tree, levels, total = [np.stack([low, high], -1)], [(0, low.shape[1])], low.size
+    while tree[-1].shape[:2] != (1, 1):
+        low, high = (
+            np.pad(box, [(0, n % 2) for n in box.shape], constant_values=beyond) for box, beyond in ((low, np.inf), (high, -np.inf))
+        )
+        low, high = (np.minimum(low[::2], low[1::2]), np.maximum(high[::2], high[1::2]))
+        low, high = (np.minimum(low[:, ::2], low[:, 1::2]), np.maximum(high[:, ::2], high[:, 1::2]))
+        tree.append(np.stack([low, high], -1))
+        levels.append((total, low.shape[1]))
+        total += low.size
+    return np.concatenate([level.reshape(-1, 2) for level in tree]), np.array(levels)
+
+
+def search(rays, breaks, parts: tuple[int, int], vertices, low, high, recursive: bool, blocks: int) -> tuple[np.ndarray, ...]:
+    """`kernels.mesh.intersect` of rays, six (N,), from the borders of the knot spans, mm, and their parts along x and y."""
+    from caustic_cli.optics.kernels.mesh import intersect  # noqa: PLC0415 - numba is slow to load
+
+    lines = [c for b, n in zip(breaks, parts, strict=True) for c in lines_of(b, n)]
+    return intersect(*rays, *lines, *parts, vertices, low, high, *pyramid_of(low, high), recursive, blocks)
+
+
 class TriangleMesh:
     """A height field approximated by triangles.
 
@@ -67,9 +99,7 @@ class TriangleMesh:
             x, y, z, dx, dy, dz: points and directions (of any length) of rays, mm; scalars where they agree.
             recursive: find knot span products by a quadtree, or by testing all of them.
         """
-        from caustic_cli.optics.kernels.mesh import intersect  # noqa: PLC0415 - numba is slow to load
-
         rays = [a.detach().double().contiguous().numpy() for a in torch.broadcast_tensors(x, y, z, dx, dy, dz)]
-        found = intersect(*rays, *self._breaks, *self.shape, self._vertices, self._low, self._high, recursive, blocks())
+        found = search(rays, self._breaks, self.shape, self._vertices, self._low, self._high, recursive, blocks())
         t, status, tests = (torch.from_numpy(a) for a in found)
         return t, status, tests

@@ -48,6 +48,8 @@ from caustic_cli.optics.sampling import Sample
 DEGREES, ERROR, POINTS = (4, 8, 12, 16, 24), 1e-11, 257
 #: Steps of the reference's iteration: convergence is quadratic.
 STEPS = 60
+#: Most steps in the fused kernel, and the relative size of a step that is not taken, since the next would be its square.
+MOST_STEPS, EXACT = 30, 1e-13
 
 
 class Bundle:
@@ -147,6 +149,19 @@ class Pencil(Bundle):
 
     def _emission_at(self, at: np.ndarray, most: float, n: float, fresnel: str) -> np.ndarray:
         return self.emission(torch.from_numpy(0.5 * most * (np.asarray(at) + 1.0)), n, fresnel).expand(len(at)).numpy()
+
+    def newton_steps(self, n: float, thickest: float) -> int:
+        """Newton steps after which u is exact to rounding for any point at most `thickest` mm behind the entrance."""
+        x, y = self.points()
+        reach2 = float(x.square().max() + y.square().max())
+        q, z = (c.ravel() for c in np.meshgrid(np.linspace(0.0, reach2, 65), np.linspace(0.0, max(thickest, 0.0), 9)))
+        u, steps = n / (n * self.distance + z), 0
+        while True:
+            c = 1.0 / np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * u * u)
+            step = (u * (self.distance + z * c) - 1.0) / (self.distance + z * n * n * c**3)
+            if steps == MOST_STEPS or np.abs(step / u).max() < EXACT:
+                return steps
+            u, steps = u - step, steps + 1
 
     def rays(self, z: Tensor, slopes: tuple[Tensor, Tensor], n: float, fresnel: str) -> tuple[tuple, Tensor]:
         """Unit directions in front of the exit, and powers there, for its heights above the entrance, mm, and slopes, (a, b) each;

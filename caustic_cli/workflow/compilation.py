@@ -81,7 +81,7 @@ def compile_design(stages: Iterable[Stage], device: str) -> None:
     spare stages are compiled when they are needed."""
     if backend_for(device).compiled:
         by_waves = {bool(stage.waves) or stage.spare for stage in stages}
-        parts = {"refraction": True in by_waves, "fields": True in by_waves, "adjoint": False in by_waves}
+        parts = {"fields": True in by_waves, "adjoint": False in by_waves}
         compile_behind(part for part in PARTS if parts.get(part, True))
 
 

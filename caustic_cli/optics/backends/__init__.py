@@ -9,7 +9,7 @@ Stages, each with its adjoint
     interact                   refraction with Fresnel losses, or reflection
     land                       ray transfer to a plane
     splat                      accumulation on pixels
-    phase, exposure, path_change   of the wave image: a field's phase, its power on pixels, and changes of its optical paths
+    exposure, path_change      of the wave image: a field's power on pixels, and changes of its optical paths
 
 `reference.Torch` implements every stage in plain torch, on any device; `cpu.Numba` uses compiled kernels.  Callers do not depend
 on which one is used.  The kernels are differentiated in reverse mode only: within a dual level of forward mode the reference stands

@@ -89,11 +89,12 @@ class Numba(Torch):
         return lambda sag: scattered_surface(surface, sag, u, v)
 
     def spline_at(self, field, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As the reference."""
-        if not len(x):
+        """As the reference, which handles a few points of a large net."""
+        surface = self.surface_of(field)
+        if surface.few(len(x)):
             return super().spline_at(field, heights, x, y)
         at = ((0.5 * (c / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
-        return scattered_surface(self.surface_of(field), heights.double(), *at)
+        return scattered_surface(surface, heights.double(), *at)
 
     def intersect_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As the reference."""
@@ -138,18 +139,13 @@ class Numba(Torch):
         if found is not None:
             return found
         hits = RayIntersections(self.surface_of(field), origin, direction, radius)
-        hits.find(heights, None if start is None else np.ascontiguousarray(start.numpy()))
-        return torch.from_numpy(hits.t), torch.from_numpy(hits.status).long()
+        t, status = hits.find(heights, None if start is None else np.ascontiguousarray(start.numpy()))
+        return torch.from_numpy(t), torch.from_numpy(status).long()
 
     def finder(self, field, origin, direction):
         """As the reference."""
         hits = RayIntersections(self.surface_of(field), origin, direction, None)
-
-        def find(heights: Tensor) -> tuple[Tensor, Tensor]:
-            hits.find(heights)
-            return torch.from_numpy(hits.t), torch.from_numpy(hits.status)
-
-        return find
+        return lambda heights: tuple(torch.from_numpy(found) for found in hits.find(heights))
 
     def next_intersections(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
         """As the reference."""
@@ -167,12 +163,6 @@ class Numba(Torch):
             )
         direction, polarised = _components(direction), None if polarised is None else _components(polarised)
         return OutgoingRays(*interact(direction, slopes, power, eta=eta, fresnel=fresnel, field=polarised))
-
-    def phase(self, path: Tensor, sampling, length: float, behind: float, dtype: torch.dtype) -> Tensor:
-        """As the reference, which handles float64."""
-        if dtype != torch.float32:
-            return super().phase(path, sampling, length, behind, dtype)
-        return fields().phase(path, sampling, length, behind)
 
     def exposure(self, phase: Tensor, amplitude: Tensor, factor: float, shape: tuple[int, int], edges: tuple[Tensor, Tensor]):
         """As the reference, which handles float64."""

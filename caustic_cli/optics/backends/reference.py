@@ -98,10 +98,6 @@ class Torch:
         integrator = import_module("caustic_cli.optics.gradient.integrator")
         return integrator.flow(field, coefficients, point, momentum, time, steps, order)
 
-    def phase(self, path: Tensor, sampling, length: float, behind: float, dtype: torch.dtype) -> Tensor:
-        """`waves.propagation.phase_of` of all samples, in `dtype`."""
-        return import_module("caustic_cli.optics.waves.propagation").phase_of(path, sampling, length, behind).to(dtype)
-
     def exposure(self, phase: Tensor, amplitude: Tensor, factor: float, shape: tuple[int, int], edges: tuple[Tensor, Tensor]):
         """`waves.propagation.Exposure`."""
         return import_module("caustic_cli.optics.waves.propagation").Exposure(phase, amplitude, factor, shape, edges)

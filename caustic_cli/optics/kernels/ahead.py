@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
+from importlib import import_module
 from itertools import cycle
 from typing import IO
 
@@ -25,68 +26,33 @@ MOST = 3
 
 
 def _multigrid() -> None:
-    """The linear equations of the Newton steps of a transport, for a chain of sites."""
+    """What is compiled of the linear equations of the Newton steps of a transport."""
     from caustic_cli.optics.kernels import multigrid  # noqa: PLC0415
 
-    count = 5 * multigrid.SMALLEST
-    sites, one, none = np.arange(count - 1), np.ones(count), np.zeros(0, np.int64)
-    end = np.stack([sites + 1, sites], 1).ravel()
-    a = multigrid.matrix(end, np.ones(len(end)), one, one, none, none, one[:0])
-    multigrid.Multigrid(a).solve(np.linspace(-1.0, 1.0, count), 0.1)
+    start, column, one = np.arange(2, dtype=np.int32), np.zeros(1, np.int32), np.ones(1)
+    multigrid.aggregate(start, column, one)
+    multigrid.sweep(start, column, one, one, one, one.copy())
 
 
-def _surface() -> None:
-    """The evaluation of the surface at rays of a plane wave, and its adjoint."""
-    from caustic_cli.optics.kernels import fused_functions  # noqa: PLC0415
+def _calls(module: str, function: str) -> Callable[[], None]:
+    """A function that calls one of a module of this package, which is loaded then."""
 
-    fused_functions.compile_surface()
+    def call() -> None:
+        getattr(import_module(f"caustic_cli.optics.kernels.{module}"), function)()
 
-
-def _refraction() -> None:
-    """The rays that are traced for a wave image: a few points of the surface, and refraction."""
-    import torch  # noqa: PLC0415
-
-    from caustic_cli.optics.bspline import SplineSpace  # noqa: PLC0415
-    from caustic_cli.optics.kernels.refraction import interact  # noqa: PLC0415
-    from caustic_cli.optics.kernels.surface import FusedSurface  # noqa: PLC0415
-
-    one, space = torch.ones(1, dtype=torch.float64), SplineSpace.uniform(6, 3)
-    interact((0.0, 0.0, 1.0), (0.0 * one, 0.0 * one), one, eta=1.5, fresnel="exact")
-    FusedSurface((space, space), (1.0, 1.0)).evaluate(np.zeros((6, 6)), np.ones(1), np.ones(1))
-
-
-def _fields() -> None:
-    """The wave image and its adjoint."""
-    from caustic_cli.optics.kernels import fields  # noqa: PLC0415
-
-    fields.compile_kernels()
-
-
-def _image() -> None:
-    """The image by rays of a plane wave."""
-    from caustic_cli.optics.kernels import fused_functions  # noqa: PLC0415
-
-    fused_functions.compile_splat()
-    fused_functions.scattered_points((0, 0), (0, 0), 0, 1, 1, 1, True)
-
-
-def _adjoint() -> None:
-    """The adjoint of that image."""
-    from caustic_cli.optics.kernels import fused_functions  # noqa: PLC0415
-
-    fused_functions.compile_adjoint()
+    return call
 
 
 #: Parts of the kernels, in the order in which other processes compile them for a design while this one compiles what precedes them
 #: in the transport and what it needs first of the surface: one of its kernels, by whose presence in the cache a part is
-#: known to be compiled, and a function that calls all of them.
+#: known to be compiled, and a function that calls all of them.  The last four are the evaluation of the surface at rays of a plane
+#: wave and its adjoint; the wave image and its adjoint; the image by these rays; and its adjoint.
 PARTS: dict[str, tuple[str, Callable[[], None]]] = {
     "multigrid": ("multigrid.sweep", _multigrid),
-    "refraction": ("spline.evaluate_net", _refraction),
-    "surface": ("spline.pull_coefficients", _surface),
-    "fields": ("fields.pull_displacement", _fields),
-    "image": ("random_points.scatter", _image),
-    "adjoint": ("fused.backward", _adjoint),
+    "surface": ("spline.pull_coefficients", _calls("fused_functions", "compile_surface")),
+    "fields": ("fields.pull_displacement", _calls("fields", "compile_kernels")),
+    "image": ("random_points.scatter", _calls("fused_functions", "compile_image")),
+    "adjoint": ("fused.backward", _calls("fused_functions", "compile_adjoint")),
 }
 
 _processes: list[subprocess.Popen[str]] = []

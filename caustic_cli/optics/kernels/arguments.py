@@ -97,8 +97,7 @@ class RowsOfSurface(NamedTuple):
     """The surface by rows: of row i the sag is sum_k bu[i, k] net[first[i] + k], dz/dx the same with du and net_x, dz/dy with bu
     and net_y.
 
-    first (a,) int64; bu, du (a, p + 1); nets (n, b).  For oblique rays the nets are distances along them and slopes, (a, b),
-    whatever first, bu and du are.
+    first (a,) int64; bu, du (a, p + 1); nets (n, b).  Of oblique rays the first is that of distances along them.
     """
 
     first: np.ndarray

@@ -73,7 +73,7 @@ OU, OV, OZ, DU, DV, DZ, T, XI, ETA, ROW, SLOPE, HALF, Z, Z_XI, Z_ETA, H_XI, MIXE
 GX, GY, BY_T, BY_U, BY_V, BY_Z, BY_X, BY_Y = range(22 * LANES, 30 * LANES, LANES)
 ROWS = 30
 # Sizes of the scratch of Horner's scheme and of powers.
-JET, POWERS = 11 * LANES, 6 * LANES
+JET, POWERS = 11 * LANES, 3 * LANES
 
 
 @intrinsic
@@ -421,39 +421,30 @@ def _tables(w, p, q, table):
     """
     pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
     ea, ed, ec = pp * LANES, (pp + qq) * LANES, (pp + 2 * qq) * LANES
+    _powers(w, XI, 0, ec, pp, table)
+    _powers(w, ETA, ea, ed, qq, table)
+    for at in range(0, pp * LANES, LANES):
+        power, slope = table[at : at + LANES], table[ec + at : ec + at + LANES]
+        for k in range(LANES):
+            power[k], slope[k] = w[BY_Z + k] * power[k] + w[BY_U + k] * slope[k], w[BY_V + k] * power[k]
+
+
+@njit(**FAST)
+def _powers(w, x, first, second, count, table):
+    """Powers 0 to count - 1 of a row x of the scratch, and their derivatives, into the table from these places on."""
     s = carray(_stack(POWERS), (POWERS,))
     for k in range(LANES):
-        s[k], s[LANES + k], s[2 * LANES + k], s[3 * LANES + k] = w[XI + k], w[BY_Z + k], w[BY_U + k], w[BY_V + k]
-        s[4 * LANES + k], s[5 * LANES + k] = 1.0, 0.0
-    for at in range(0, pp * LANES, 2 * LANES):  # two rows in one loop: shorter ones are unrolled ray by ray, not made vectors
-        a0, a1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
-        c0, c1 = table[ec + at : ec + at + LANES], table[ec + at + LANES : ec + at + 2 * LANES]
+        s[k], s[LANES + k], s[2 * LANES + k] = w[x + k], 1.0, 0.0
+    for at in range(0, count * LANES, 2 * LANES):  # two rows in one loop: shorter ones are unrolled ray by ray, not made vectors
+        e0, e1 = table[first + at : first + at + LANES], table[first + at + LANES : first + at + 2 * LANES]
+        d0, d1 = table[second + at : second + at + LANES], table[second + at + LANES : second + at + 2 * LANES]
         for k in range(LANES):
-            xi, by_z, by_xi, by_eta, power, slope = (
-                s[k],
-                s[LANES + k],
-                s[2 * LANES + k],
-                s[3 * LANES + k],
-                s[4 * LANES + k],
-                s[5 * LANES + k],
-            )
-            a0[k], c0[k] = by_z * power + by_xi * slope, by_eta * power
-            slope = slope * xi + power
-            power *= xi
-            a1[k], c1[k] = by_z * power + by_xi * slope, by_eta * power
-            s[4 * LANES + k], s[5 * LANES + k] = power * xi, slope * xi + power
-    for k in range(LANES):
-        s[k], s[4 * LANES + k], s[5 * LANES + k] = w[ETA + k], 1.0, 0.0
-    for at in range(0, qq * LANES, 2 * LANES):
-        e0, e1 = table[ea + at : ea + at + LANES], table[ea + at + LANES : ea + at + 2 * LANES]
-        d0, d1 = table[ed + at : ed + at + LANES], table[ed + at + LANES : ed + at + 2 * LANES]
-        for k in range(LANES):
-            eta, power, slope = s[k], s[4 * LANES + k], s[5 * LANES + k]
+            x_, power, slope = s[k], s[LANES + k], s[2 * LANES + k]
             e0[k], d0[k] = power, slope
-            slope = slope * eta + power
-            power *= eta
+            slope = slope * x_ + power
+            power *= x_
             e1[k], d1[k] = power, slope
-            s[4 * LANES + k], s[5 * LANES + k] = power * eta, slope * eta + power
+            s[LANES + k], s[2 * LANES + k] = power * x_, slope * x_ + power
 
 
 @njit(**SUMS)
@@ -461,26 +452,19 @@ def _gather(table, p, q, total):
     """Add the sums over the lanes that `_tables` describes to total (p', q')."""
     pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
     for a in range(0, pp, 2):
+        c, f = table[a * LANES : (a + 2) * LANES], table[(pp + 2 * qq + a) * LANES : (pp + 2 * qq + a + 2) * LANES]
         for b in range(0, qq, 4):
-            a0, a1 = table[a * LANES : (a + 1) * LANES], table[(a + 1) * LANES : (a + 2) * LANES]
-            at = (pp + b) * LANES
-            e0, e1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
-            e2, e3 = table[at + 2 * LANES : at + 3 * LANES], table[at + 3 * LANES : at + 4 * LANES]
-            at = (pp + qq + b) * LANES
-            d0, d1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
-            d2, d3 = table[at + 2 * LANES : at + 3 * LANES], table[at + 3 * LANES : at + 4 * LANES]
-            at = (pp + 2 * qq + a) * LANES
-            f0, f1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
+            e, d = table[(pp + b) * LANES : (pp + b + 4) * LANES], table[(pp + qq + b) * LANES : (pp + qq + b + 4) * LANES]
             s0, s1, s2, s3, s4, s5, s6, s7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for k in range(LANES):
-                s0 += a0[k] * e0[k] + f0[k] * d0[k]
-                s1 += a0[k] * e1[k] + f0[k] * d1[k]
-                s2 += a0[k] * e2[k] + f0[k] * d2[k]
-                s3 += a0[k] * e3[k] + f0[k] * d3[k]
-                s4 += a1[k] * e0[k] + f1[k] * d0[k]
-                s5 += a1[k] * e1[k] + f1[k] * d1[k]
-                s6 += a1[k] * e2[k] + f1[k] * d2[k]
-                s7 += a1[k] * e3[k] + f1[k] * d3[k]
+                s0 += c[k] * e[k] + f[k] * d[k]
+                s1 += c[k] * e[LANES + k] + f[k] * d[LANES + k]
+                s2 += c[k] * e[2 * LANES + k] + f[k] * d[2 * LANES + k]
+                s3 += c[k] * e[3 * LANES + k] + f[k] * d[3 * LANES + k]
+                s4 += c[LANES + k] * e[k] + f[LANES + k] * d[k]
+                s5 += c[LANES + k] * e[LANES + k] + f[LANES + k] * d[LANES + k]
+                s6 += c[LANES + k] * e[2 * LANES + k] + f[LANES + k] * d[2 * LANES + k]
+                s7 += c[LANES + k] * e[3 * LANES + k] + f[LANES + k] * d[3 * LANES + k]
             total[a, b] += s0
             total[a, b + 1] += s1
             total[a, b + 2] += s2

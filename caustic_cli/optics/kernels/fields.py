@@ -21,12 +21,12 @@ from torch import Tensor
 
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.refraction import interact
 from caustic_cli.optics.kernels.spline import place
 from caustic_cli.optics.kernels.surface import FusedSurface
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.waves.propagation import TURN, Exposure, ramp
-from caustic_cli.optics.waves.sampling import Sampling
+from caustic_cli.optics.waves.propagation import Exposure
 from caustic_cli.optics.waves.wavefront import LastSurface, PathChange
 from caustic_cli.scene import Lens
 
@@ -181,19 +181,6 @@ def pull_displacement(block, u, v, by, pu, pv, pieces, weight, grads):
                 along *= xi
 
 
-@njit(entry=True, **FAST)
-def reduce_phase(block, path, turns, across, along, out, blocks):
-    """2 pi frac(turns path + across + along) -> out (n, m) float32: path (n, m), mm, ramps of both axes, in turns."""
-    if on_threads(block, blocks, (path, turns, across, along, out, blocks)):
-        return
-    n, m = path.shape
-    for k in range(block * n // blocks, (block + 1) * n // blocks):
-        row, found = path[k], out[k]
-        for j in range(m):
-            x = row[j] * turns + (across[k] + along[j])
-            found[j] = 2.0 * np.pi * (x - np.floor(x))
-
-
 class FusedExposure(Exposure):
     """`waves.propagation.Exposure` by these kernels, in float32; the field of all exposures of one shape is the same memory."""
 
@@ -275,20 +262,14 @@ class FusedPathChange(PathChange):
 
 
 def compile_kernels() -> None:
-    """Load all of them from the cache, or compile them, by calling them on the least of fields."""
+    """Load all of them from the cache, or compile them, by calling them on the least of fields; and before them refraction of the
+    rays that are traced for it."""
+    ray = torch.ones(1, dtype=torch.float64)
+    interact((0.0, 0.0, 1.0), (0.0 * ray, 0.0 * ray), ray, eta=1.5, fresnel="exact")
     surface, one = HeightField.of(Lens((2.0, 2.0), control=(4, 4))), torch.ones(1, 1)
-    sampling = Sampling((-1.0, -1.0), (2.0, 2.0), (1, 1), (2, 2), (0.0, 0.0), 100.0)
     edges = torch.linspace(0.0, 2.0, 2, dtype=torch.float64)
-    light = FusedExposure(phase(one.double(), sampling, 5e-4, 5e-4), one, 1.0, (2, 2), (edges, edges))
+    light = FusedExposure(one, one, 1.0, (2, 2), (edges, edges))
     paths = FusedPathChange(surface, LastSurface(one.double(), one.double(), one.double()), torch.float32)
     out = torch.zeros(1, 1)
     light.pull(light.image(paths.of(torch.zeros(4, 4, dtype=torch.float64))), one, out)
     paths.pull(out)
-
-
-def phase(path: Tensor, sampling: Sampling, length: float, behind: float) -> Tensor:
-    """`waves.propagation.phase_of` in one pass, float32."""
-    out = torch.empty(path.shape, dtype=torch.float32)
-    across, along = ((ramp(sampling, behind, k, path.device) / TURN).numpy() for k in (0, 1))
-    reduce_phase(ALL, path.contiguous().numpy(), 1.0 / length, across, along, out.numpy(), blocks())
-    return out

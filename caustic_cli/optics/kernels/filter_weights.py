@@ -50,18 +50,12 @@ def _cosine(x):
 
 
 @njit(inline="always", **FAST)
-def _scaled(by, phi, v, out):
-    """out[j] = by f(by phi') for the cosine filter's two functions: out[0] cosines, out[1] sines of theta q, over v."""
-    for j in range(len(phi)):
-        out[0, j] = _cosine(by * (0.5 - phi[j])) / v
-    for j in range(len(phi)):
-        out[1, j] = _sine(by * (0.5 - phi[j])) / v
-
-
-@njit(inline="always", **FAST)
 def _raised_cosine(phi, v, out, slope, scratch):
     theta = 2.0 * math.pi / v
-    _scaled(theta, phi, v, scratch)
+    for j in range(len(phi)):
+        scratch[0, j] = _cosine(theta * (0.5 - phi[j])) / v
+    for j in range(len(phi)):
+        scratch[1, j] = _sine(theta * (0.5 - phi[j])) / v
     for k in range(v):  # cos(theta (k - r + q)) by addition
         c, s = math.cos(theta * (k - (v - 1) // 2)), math.sin(theta * (k - (v - 1) // 2))
         _mix(1.0 / v, c, -s, scratch[0], scratch[1], out[k][: len(phi)])

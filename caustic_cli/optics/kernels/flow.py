@@ -26,10 +26,13 @@ WIDE = 16
 
 
 def _forward(index):
-    @njit(**FAST)
-    def some(begin, end, c, medium, ray, time, weights, steps, out):
-        room = np.empty((3, WIDE)), np.empty((3, WIDE)), np.empty((3, WIDE))
-        for at in range(begin, end):
+    @njit(entry=True, **FAST)
+    def flow(block, c, medium, ray, time, weights, steps, out, blocks):
+        """q, p, S and L (8, N), from ray: q and p, six components."""
+        if on_threads(block, blocks, (c, medium, ray, time, weights, steps, out, blocks)):
+            return
+        room, count = (np.empty((3, WIDE)), np.empty((3, WIDE)), np.empty((3, WIDE))), len(time)
+        for at in range(block * count // blocks, (block + 1) * count // blocks):
             x, y, z, px, py, pz = ray[0][at], ray[1][at], ray[2][at], ray[3][at], ray[4][at], ray[5][at]
             path, length, h = 0.0, 0.0, time[at] / steps
             for _ in range(steps):
@@ -47,22 +50,18 @@ def _forward(index):
             out[0][at], out[1][at], out[2][at], out[3][at], out[4][at], out[5][at] = x, y, z, px, py, pz
             out[6][at], out[7][at] = path, length
 
-    @njit(entry=True, **FAST)
-    def flow(block, c, medium, ray, time, weights, steps, out, blocks):
-        """q, p, S and L (8, N), from ray: q and p, six components."""
-        if on_threads(block, blocks, (c, medium, ray, time, weights, steps, out, blocks)):
-            return
-        count = len(time)
-        some(block * count // blocks, (block + 1) * count // blocks, c, medium, ray, time, weights, steps, out)
-
     return flow
 
 
 def _backward(adjoint):
-    @njit(**FAST)
-    def some(begin, end, c, medium, ends, time, weights, steps, by, out, by_c):
-        room = np.empty((3, WIDE)), np.empty((3, WIDE)), np.empty((3, WIDE))
-        for at in range(begin, end):
+    @njit(entry=True, **FAST)
+    def flow_adjoint(block, c, medium, ends, time, weights, steps, by, out, by_c):
+        """Derivatives by q, p and time into out (7, N), by c into by_c (blocks, ...), from those by q, p, S and L."""
+        count, blocks = len(time), len(by_c)
+        if on_threads(block, blocks, (c, medium, ends, time, weights, steps, by, out, by_c)):
+            return
+        room, own = (np.empty((3, WIDE)), np.empty((3, WIDE)), np.empty((3, WIDE))), by_c[block]
+        for at in range(block * count // blocks, (block + 1) * count // blocks):
             x, y, z, px, py, pz = ends[0][at], ends[1][at], ends[2][at], ends[3][at], ends[4][at], ends[5][at]
             lx, ly, lz, mx, my, mz = by[0][at], by[1][at], by[2][at], by[3][at], by[4][at], by[5][at]
             s, t, by_time, h = by[6][at], by[7][at], 0.0, time[at] / steps
@@ -75,7 +74,7 @@ def _backward(adjoint):
                     mx, my, mz = mx + a * (lx + s * px), my + a * (ly + s * py), mz + a * (lz + s * pz)
                     x, y, z = x - a * px, y - a * py, z - a * pz
                     # kick
-                    square, n, fx, fy, fz, gx, gy, gz = adjoint(c, medium, x, y, z, mx, my, mz, s, t, b, room, by_c)
+                    square, n, fx, fy, fz, gx, gy, gz = adjoint(c, medium, x, y, z, mx, my, mz, s, t, b, room, own)
                     rate += fx * mx + fy * my + fz * mz + 0.5 * s * square + t * n
                     lx, ly, lz = lx + b * gx, ly + b * gy, lz + b * gz
                     px, py, pz = px - b * fx, py - b * fy, pz - b * fz
@@ -86,15 +85,6 @@ def _backward(adjoint):
                     by_time += w * rate
             out[0][at], out[1][at], out[2][at], out[3][at], out[4][at], out[5][at] = lx, ly, lz, mx, my, mz
             out[6][at] = by_time / steps
-
-    @njit(entry=True, **FAST)
-    def flow_adjoint(block, c, medium, ends, time, weights, steps, by, out, by_c):
-        """Derivatives by q, p and time into out (7, N), by c into by_c (blocks, ...), from those by q, p, S and L."""
-        count, blocks = len(time), len(by_c)
-        if on_threads(block, blocks, (c, medium, ends, time, weights, steps, by, out, by_c)):
-            return
-        begin, end = block * count // blocks, (block + 1) * count // blocks
-        some(begin, end, c, medium, ends, time, weights, steps, by, out, by_c[block])
 
     return flow_adjoint
 

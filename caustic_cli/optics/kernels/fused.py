@@ -15,7 +15,6 @@ from caustic_cli.optics.kernels import rows as row
 from caustic_cli.optics.kernels.jit import FAST, SUMS, njit
 from caustic_cli.optics.kernels.rows import WIDE, spread
 from caustic_cli.optics.kernels.splat import gather, scatter, share
-from caustic_cli.optics.kernels.stage import store
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 LOST_BY_FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # of the ledger
@@ -23,7 +22,7 @@ LOST_BY_FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # o
 
 @njit(**SUMS)
 def _account(flux, power, ledger):
-    """Add a batch's losses at the surface, and the power that leaves it; that of lost rays becomes 0."""
+    """Add a batch's losses, and the power that leaves it, unless `ledger` is None; the power of lost rays becomes 0."""
     fresnel, reflected, missed, leaving = 0.0, 0.0, 0.0, 0.0
     for j in range(len(power)):
         emitted, weight = flux[j], power[j]
@@ -33,16 +32,11 @@ def _account(flux, power, ledger):
         reflected += emitted if lost and weight != row.MISSED_POWER else 0.0
         missed += emitted if weight == row.MISSED_POWER else 0.0
         power[j] = 0.0 if lost else weight
-    ledger[LOST_BY_FRESNEL] += fresnel
-    ledger[REFLECTED] += reflected
-    ledger[LEAVING] += leaving
-    ledger[MISSED] += missed
-
-
-@njit(**FAST)
-def _remove_lost(power):
-    for j in range(len(power)):
-        power[j] = 0.0 if power[j] < 0.0 else power[j]
+    if ledger is not None:
+        ledger[LOST_BY_FRESNEL] += fresnel
+        ledger[REFLECTED] += reflected
+        ledger[LEAVING] += leaving
+        ledger[MISSED] += missed
 
 
 @njit(entry=True, **FAST)
@@ -79,7 +73,7 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, surface, rays, exi
     apart: no two rows share a row of the nets, so that a single sum suffices for all blocks.  Otherwise net_x is taken to be net
     itself, and the sum of both derivatives comes as the first.  scratch: overwritten, as in `forward`.
     """
-    if block == ALL and apart and oblique is None:
+    if block == ALL and apart:
         nets[:] = 0.0
     if on_threads(
         block,
@@ -96,14 +90,9 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, surface, rays, exi
         for start in range(0, columns, WIDE):
             count = min(WIDE, columns - start)
             landing.aim(v, i, start, count, surface, rays, exit_, frame, oblique, point, parallel)
-            _remove_lost(v[row.POWER][:count])
+            _account(v[row.FLUX][:count], v[row.POWER][:count], None)
             share(v, count, splat, sx, sy, dx, dy)
             gather(v, count, frame, splat, sx, sy, dx, dy, grad, grad_leaving, grad_leaving, column, tilt)
             landing.pull(v, count, exit_, oblique, point, parallel)
-            if oblique is not None:
-                store(v[row.BY_SAG], start, count, nets[0, 0, i])
-                store(v[row.BY_GX], start, count, nets[1, 0, i])
-                store(v[row.BY_GY], start, count, nets[2, 0, i])
-            else:
-                by_sag, by_gx, by_gy = v[row.BY_SAG][:count], v[row.BY_GX][:count], v[row.BY_GY][:count]
-                spread(i, start, surface, by_sag, by_gx, by_gy, nets[:, to], apart)
+            by_sag, by_gx, by_gy = v[row.BY_SAG][:count], v[row.BY_GX][:count], v[row.BY_GY][:count]
+            spread(i, start, surface, by_sag, by_gx, by_gy, nets[:, to], apart)

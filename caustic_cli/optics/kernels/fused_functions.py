@@ -6,7 +6,6 @@ refracts, transfers to the screen and splats.  Everything is float64, whatever t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -159,29 +158,16 @@ class PencilKernel(PlaneKernel):
     ):
         sample, self.place = pencil.sample, pencil.position[:2]
         super().__init__(spaces, half_size, sample.u, sample.v, True, sample.flux, like, self.place)
-        self.distance, self.z_in, self.index = pencil.distance, pencil.z_in, index
-        self.coefficients, most = emission
+        self.pencil, self.index, (self.coefficients, most) = pencil, index, emission
         self.scale = 2.0 / most
-        self.reach2 = float(np.square(self.rays.x).max() + np.square(self.rays.y).max())
-
-    def steps(self, thickest: float) -> int:
-        """Newton steps after which u is exact to rounding for any point at most `thickest` mm behind the entrance."""
-        q, z = (c.ravel() for c in np.meshgrid(np.linspace(0.0, self.reach2, 65), np.linspace(0.0, max(thickest, 0.0), 9)))
-        n, h = self.index, self.distance
-        u, steps = n / (n * h + z), 0
-        while True:
-            c = 1.0 / np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * u * u)
-            step = (u * (h + z * c) - 1.0) / (h + z * n * n * c**3)
-            if steps == MOST_STEPS or np.abs(step / u).max() < EXACT:
-                return steps
-            u, steps = u - step, steps + 1
 
     def __call__(self, sag: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
         """Control heights (n, m) float64 relative to `reference`, mm: see `_splat`."""
-        steps = self.steps(float(sag.detach().max()) + reference - self.z_in)
-        point = Point(float(self.distance), float(self.index), steps, self.scale, self.coefficients)
+        z_in = self.pencil.z_in
+        steps = self.pencil.newton_steps(self.index, float(sag.detach().max()) + reference - z_in)
+        point = Point(float(self.pencil.distance), float(self.index), steps, self.scale, self.coefficients)
         frame = ScreenFrame.of(screen, (screen.low[0] - self.place[0], screen.low[1] - self.place[1]))
-        ends = self.z_in - reference, screen.z - reference
+        ends = z_in - reference, screen.z - reference
         return self._splatted(sag, (eta, fresnel), ends, screen, filter, (point, None), frame)
 
 
@@ -208,41 +194,17 @@ class RayKernel:
         x, y, *direction = (t.double()[order] for t in (*origin[:2], *direction))
         power = power.double()[order]
         power[count:] = 0.0
-        #: Distances from the origins to where rays enter the aperture, (N,) mm; None where all start inside.
-        self.way = _way_inside(half_size, (x, y), direction)
-        start = x, y, origin[2]
-        if self.way is not None:
-            start = tuple(o + self.way * d for o, d in zip(start, direction, strict=True))
-        self.hits, self.z = RayIntersections(self.surface, start, direction, radius), origin[2]
+        self.hits, self.z = RayIntersections(self.surface, (x, y, origin[2]), direction, radius, enter_first=True), origin[2]
         self.rays = RowsOfRays(*(_strided(t.view(self.shape).numpy()) for t in (x, y, *direction[:2], power)))
-        ones = np.ones((self.shape[0], 1))
-        self.rows = (np.arange(self.shape[0]), ones, ones)
+        self.rows = np.arange(self.shape[0]), *np.ones((2, self.shape[0], 1))
 
     def __call__(self, heights: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
         """Control heights (n, m) mm float64; `reference` is where the screen's height is counted from, mm: see `_splat`."""
         reach, *slopes = self.hits(heights)
-        if self.way is not None:
-            reach = torch.where(reach >= 0.0, reach + self.way, reach)
+        reach = torch.where(reach >= 0.0, reach + torch.from_numpy(self.hits.way), reach)
         nets = [t.view(self.shape) for t in (reach, *slopes)]
         heights_of = self.z - reference, screen.z - reference
         return _splat(nets, self.rows, True, self.rays, (eta, fresnel), heights_of, screen, filter, self.workspace)
-
-
-def _way_inside(half_size: tuple[float, float], origin: tuple[Tensor, Tensor], direction: list[Tensor]) -> Tensor | None:
-    """Distances along rays from origins outside a rectangle to where they enter it, 0 from inside and for those that never do, (N,)
-    mm; None where all start inside."""
-    way, last = torch.zeros_like(origin[0]), torch.full_like(origin[0], math.inf)
-    for o, d, r in zip(origin, direction, half_size, strict=False):
-        one, other = ((side * r - o) / d for side in (-1.0, 1.0))
-        beside = d == 0.0
-        way = torch.maximum(way, torch.where(beside, 0.0, torch.minimum(one, other)))
-        last = torch.minimum(last, torch.where(beside, math.inf, torch.maximum(one, other)))
-    way = torch.where(way < last, way, 0.0)
-    return way if bool((way > 0.0).any()) else None
-
-
-#: Largest number of Newton steps, and the relative size of a step that is not taken, since the next would be its square.
-MOST_STEPS, EXACT = 30, 1e-13
 
 
 def _splat(
@@ -314,13 +276,14 @@ def compile_surface() -> None:
     torch.stack([t.sum() for t in (net, slope, *found)]).sum().backward()
 
 
-def compile_splat() -> None:
-    """Compile the fused refraction, transfer and splat."""
+def compile_image() -> None:
+    """Compile the fused refraction, transfer and splat, and the points of scattered rays."""
     _IMAGE(*_example())
+    scattered_points((0, 0), (0, 0), 0, 1, 1, 1, True)
 
 
 def compile_adjoint() -> None:
-    """Compile the adjoint of the kernel of `compile_splat`."""
+    """Compile the adjoint of the kernel of `compile_image`."""
     parameters, *nets = _example()
     _, _, frame, splat, *_ = parameters[2]
     image = np.zeros(splat.padded(frame))

@@ -208,20 +208,16 @@ def _climbed(task, phi, y1, y2, x1, x2, psi, at):
         psi[p], at[p] = best, there
 
 
-def averages(phi, site, y1, y2, weights, step, low, out) -> None:
+@njit(entry=True, nogil=True)
+def averages(i, phi, site, y1, y2, weights, step, low, out):
     """Weighted averages of phi and its gradient over squares of a raster, at every `step`-th of its points.
 
     Args:
+        i: a row of the averages, or ALL.
         phi, site: of `envelope`; y1, y2: (N,) coordinates of the sites.
         weights: (k,) along either axis; low: of the first square, along the first axis; it begins with the second.
         out: (3, n, m) to be filled.
     """
-    _averages(ALL, phi, site, y1, y2, weights, step, low, out)
-
-
-@njit(entry=True, nogil=True)
-def _averages(i, phi, site, y1, y2, weights, step, low, out):
-    """Row i of `averages`."""
     n, m = out.shape[1:]
     if on_threads(i, n, (phi, site, y1, y2, weights, step, low, out)):
         return

@@ -18,7 +18,6 @@ import math
 from caustic_cli.optics.kernels import axial_refraction, refraction, rows, transfer
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.rows import AT, DX, DY, GX, GY, J_S, SAG, J, P, U, X, Y
-from caustic_cli.optics.kernels.stage import load
 
 # No array is passed on inside these loops, nor taken from a tuple: they would not be vectorised.
 
@@ -134,14 +133,10 @@ def aim(v, i, begin, count, surface, rays, exit_, frame, oblique, point, paralle
     rows.load(rays.x[i][begin : begin + count], v[X][:count])
     rows.load(rays.y[i][begin : begin + count], v[Y][:count])
     rows.load(rays.flux[i][begin : begin + count], v[P][:count])
+    rows.combine(i, begin, surface, v[SAG][:count], v[GX][:count], v[GY][:count])
     if oblique is not None:
-        load(surface.net[i], begin, count, v[SAG])
-        load(surface.net_x[i], begin, count, v[GX])
-        load(surface.net_y[i], begin, count, v[GY])
         rows.load(rays.along_x[i][begin : begin + count], v[DX][:count])
         rows.load(rays.along_y[i][begin : begin + count], v[DY][:count])
-    else:
-        rows.combine(i, begin, surface, v[SAG][:count], v[GX][:count], v[GY][:count])
     if point is not None:
         _cross(v, count, start, point)
         _emit(v, count, point, point.emission)

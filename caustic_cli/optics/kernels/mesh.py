@@ -212,57 +212,22 @@ def _descend(ray, first, end, gx, gy, hx, hy, z, nu, nv, rows, cols, tree, level
 
 
 @njit()
-def _grid(breaks, n):
-    """Grid lines, and the reciprocal widths of the cells above them."""
-    lines = np.empty((len(breaks) - 1) * n + 1)
-    for i in range(len(breaks) - 1):
-        for k in range(n):
-            lines[i * n + k] = breaks[i] + (breaks[i + 1] - breaks[i]) * (k / n)
-    lines[-1] = breaks[-1]
-    return lines, 1.0 / (lines[1:] - lines[:-1])
-
-
-@njit()
-def _pyramid(low, high):
-    """Lowest and highest of 2^l x 2^l boxes: tree (., 2), and of each level l its beginning there and its columns."""
-    rows, cols, count = low.shape[0], low.shape[1], 1
-    while max(rows, cols) > 1 << (count - 1):
-        count += 1
-    levels = np.empty((count, 2), dtype=np.int64)
-    total = 0
-    for level in range(count):
-        side = 1 << level
-        levels[level, 0], levels[level, 1] = total, (cols + side - 1) >> level
-        total += ((rows + side - 1) >> level) * levels[level, 1]
-    tree = np.empty((total, 2))
-    tree[:, 0], tree[:, 1] = math.inf, -math.inf
-    for level in range(count):
-        for i in range(rows):
-            for j in range(cols):
-                at = levels[level, 0] + (i >> level) * levels[level, 1] + (j >> level)
-                tree[at, 0], tree[at, 1] = min(tree[at, 0], low[i, j]), max(tree[at, 1], high[i, j])
-    return tree, levels
-
-
-@njit()
 def _inward(o, d, last, width):
     """A ray along the aperture's far border belongs to the cells along it."""
     return np.nextafter(last, last - width) if d == 0.0 and o == last else o
 
 
 @njit(parallel=True)
-def intersect(x, y, z, dx, dy, dz, xs, ys, n_u, n_v, vertices, low, high, recursive, blocks):
+def intersect(x, y, z, dx, dy, dz, gx, hx, gy, hy, n_u, n_v, vertices, low, high, tree, levels, recursive, blocks):
     """Times t (N,) of the rays' hits, infinite without; status (N,) int8; triangles tested (N,) int32.
 
     A ray that begins outside the aperture enters where its path does.  One that begins or enters above the surface, or leaves
     the aperture below it, misses.
 
-    x, y, z, dx, dy, dz: (N,) float64, any length of direction.  xs (a + 1,), ys (b + 1,): borders of the knot spans, mm.
-    vertices (a n_u + 1, b n_v + 1).  low, high (a, b): of the boxes, which must hold the vertices.
+    x, y, z, dx, dy, dz: (N,) float64, any length of direction.  gx, hx, gy, hy: grid lines, mm, and one over the widths of the
+    cells above them.  vertices (a n_u + 1, b n_v + 1).  low, high (a, b): of the boxes, which must hold the vertices.  tree,
+    levels: of larger boxes, `optics.mesh.pyramid_of`.
     """
-    gx, hx = _grid(xs, n_u)
-    gy, hy = _grid(ys, n_v)
-    tree, levels = _pyramid(low, high)
     rows, cols, root = low.shape[0], low.shape[1], len(tree) - 1
     count = len(x)
     t, status, tested = np.full(count, math.inf), np.full(count, np.int8(MISSED)), np.zeros(count, dtype=np.int32)

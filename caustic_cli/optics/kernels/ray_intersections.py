@@ -59,15 +59,18 @@ class RayIntersections:
     Args:
         origin, direction: (N,) float64 each, mm, inside the aperture, and unit vectors; z of the origins may be one number.
         radius: of a circular aperture, mm, or None.
+        enter_first: distances are those from where rays enter the aperture, at `way` (N,) mm from an origin outside it.
     """
 
-    def __init__(self, surface: FusedSurface, origin, direction, radius: float | None):
+    def __init__(self, surface: FusedSurface, origin, direction, radius: float | None, enter_first: bool = False):
         self.surface, (x, y, self.z) = surface, origin
         if isinstance(self.z, Tensor):
             self.z = self.z.double().numpy()
-        self.rays = scaled(surface, (x, y, torch.empty_like(x)), direction)
+        self.rays, self.way = scaled(surface, (x, y, torch.empty_like(x)), direction), np.zeros(len(x))
+        if enter_first:
+            enter(ALL, self.rays, -np.inf, self.way, blocks())
+            self.z = self.z + self.way * self.rays[5]
         self.radius = np.inf if radius is None else radius
-        self.t, self.status = np.zeros(len(x)), np.zeros(len(x), np.int8)
         self.order, used = batches.order(*self.rays[:2], surface.pieces.breaks_u, surface.pieces.breaks_v)
         self.batched = len(x) >= batches.CROWD * used
         if not self.batched:
@@ -78,28 +81,19 @@ class RayIntersections:
         t, gx, gy, *_ = _HITS((self.surface, self), heights)
         return t, gx, gy
 
-    def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
-        """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
-
-        start: as of `search`.
-        """
-        c, hits = self.search(heights, start)
-        self.status, self.t = hits.status, np.maximum(hits.reach, 0.0)
-        return c
+    def find(self, heights: Tensor, start: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Distances (N,), mm, 0 for none, and status of every ray.  start: as of `search`."""
+        _, hits = self.search(heights, start)
+        return np.maximum(hits.reach, 0.0), hits.status
 
     def search(self, heights: Tensor, start: np.ndarray | None = None) -> tuple[np.ndarray, batches.Hits]:
         """Coefficients of the surface, counted from the heights' mean, and the first intersections.
 
         start: estimates of the distances (N,), infinite for none; None if unknown.
         """
-        h, batched = self._lower(heights), self.batched and start is None
-        return _first_hits(self.surface, h, _limits(h), self.rays, self.order, batched, self.radius, start)
-
-    def _lower(self, heights: Tensor) -> Tensor:
-        """Heights less their mean, from which the rays then start."""
-        h, middle = sag_of(heights)
+        (h, middle), batched = sag_of(heights), self.batched and start is None
         self.rays[2][:] = self.z - middle
-        return h
+        return _first_hits(self.surface, h, _limits(h), self.rays, self.order, batched, self.radius, start)
 
 
 def _limits(h: Tensor) -> tuple[float, float]:

@@ -179,19 +179,17 @@ def trimmed(padded: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Ten
 
 
 @njit(**FAST)
-def _pixels(x, low, wide, count, out):
-    for j in range(count):
+def _pixels(x, low, wide, out):
+    for j in range(len(out)):
         out[j] = (x[j] - low) / wide
 
 
 @njit(**FAST)
 def aim(x, y, weight, start, count, frame, v):
-    """Pixel coordinates and powers of one row of rays."""
-    load(x, start, count, v[row.PX])
-    load(y, start, count, v[row.PY])
+    """Pixel coordinates and powers of a batch of rays."""
+    _pixels(x[start:], frame.low_x, frame.pixel_x, v[row.PX][:count])
+    _pixels(y[start:], frame.low_y, frame.pixel_y, v[row.PY][:count])
     load(weight, start, count, v[row.POWER])
-    _pixels(v[row.PX], frame.low_x, frame.pixel_x, count, v[row.PX])
-    _pixels(v[row.PY], frame.low_y, frame.pixel_y, count, v[row.PY])
 
 
 @njit(entry=True, **FAST)

@@ -181,45 +181,6 @@ def evaluate(block, u, v, c, pieces, z, zx, zy, blocks):
         z[k], zx[k], zy[k] = value, along * pieces.over_u[i] * pieces.scale_x, across * pieces.over_v[j] * pieces.scale_y
 
 
-@njit(inline="always", **FAST)
-def _basis(matrix, x, out):
-    """Basis functions that do not vanish on a piece and their slopes at x into out (2, p + 1); matrix: as of `Axis`."""
-    count = len(matrix)
-    for k in range(count):
-        value, slope = matrix[count - 1, k], 0.0
-        for a in range(count - 2, -1, -1):
-            slope = slope * x + value
-            value = value * x + matrix[a, k]
-        out[0, k], out[1, k] = value, slope
-
-
-@njit(entry=True, **FAST)
-def evaluate_net(block, u, v, net, linear, pieces, z, zx, zy, blocks):
-    """`evaluate` from the control heights (n, m) themselves, whose coefficients take longer where pieces are more than points.
-
-    linear: `first` and `matrices` of both axes.
-    """
-    if on_threads(block, blocks, (u, v, net, linear, pieces, z, zx, zy, blocks)):
-        return
-    fu, tu, fv, tv = linear
-    count, along_u, along_v = len(u), np.empty((2, tu.shape[1])), np.empty((2, tv.shape[1]))
-    for k in range(block * count // blocks, (block + 1) * count // blocks):
-        i, j, xi, eta = place(u[k], v[k], pieces)
-        _basis(tu[i], xi, along_u)
-        _basis(tv[j], eta, along_v)
-        value, by_x, by_y = 0.0, 0.0, 0.0
-        for a in range(len(tu[i])):
-            row, slope = 0.0, 0.0
-            for b in range(len(tv[j])):
-                height = net[fu[i] + a, fv[j] + b]
-                row += height * along_v[0, b]
-                slope += height * along_v[1, b]
-            value += row * along_u[0, a]
-            by_x += row * along_u[1, a]
-            by_y += slope * along_u[0, a]
-        z[k], zx[k], zy[k] = value, by_x * pieces.over_u[i] * pieces.scale_x, by_y * pieces.over_v[j] * pieces.scale_y
-
-
 @njit(entry=True, **FAST)
 def pull_back(block, u, v, gz, gx, gy, pieces, grads):
     """Adjoint of `evaluate`: derivatives by the coefficients into grads (blocks, I, J, p + 1, q + 1), overwritten."""

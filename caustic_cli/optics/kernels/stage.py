@@ -60,17 +60,13 @@ def store_flags(row, start, count, flags):
 def _kernel(batch, rows: int):
     """A kernel that runs a batch function over all rays."""
 
-    @njit(**FAST)
-    def some(begin, end, ray, parameters, given, out):
-        v = np.empty((rows, BATCH))
-        for start in range(begin, end, BATCH):
-            batch(v, start, min(BATCH, end - start), ray, parameters, given, out)
-
     @njit(entry=True, **FAST)
     def kernel(block, count, ray, parameters, given, out, blocks):
         if on_threads(block, blocks, (count, ray, parameters, given, out, blocks)):
             return
-        some(block * count // blocks, (block + 1) * count // blocks, ray, parameters, given, out)
+        v, end = np.empty((rows, BATCH)), (block + 1) * count // blocks
+        for start in range(block * count // blocks, end, BATCH):
+            batch(v, start, min(BATCH, end - start), ray, parameters, given, out)
 
     return kernel
 

@@ -13,8 +13,8 @@ from caustic_cli.optics.kernels import batches, blocks, intersect, spline
 from caustic_cli.optics.kernels.stage import KernelStage, array
 from caustic_cli.optics.kernels.threads import ALL
 
-#: Points per piece of the surface below which they are evaluated from the control heights instead of from all coefficients.
-FEW = 1.0
+#: Points per piece of the surface up to which the coefficients of all pieces take longer than the reference takes for the points.
+FEW = 0.1
 
 
 class FusedSurface:
@@ -28,6 +28,10 @@ class FusedSurface:
         self.pieces = spline.Pieces._make((*(x for a in self.axes for x in a.geometry), *self.scale))
         self.grads: np.ndarray | None = None
         self.last: tuple[Tensor, np.ndarray] | None = None
+
+    def few(self, points: int) -> bool:
+        """Whether the reference is faster for so many points."""
+        return points <= FEW * math.prod(self._coefficients()[:2])
 
     def coefficients(self, heights: Tensor) -> np.ndarray:
         """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64; cached for the last heights, since all
@@ -43,10 +47,7 @@ class FusedSurface:
     def evaluate(self, heights: np.ndarray, u: np.ndarray, v: np.ndarray) -> list[np.ndarray]:
         """z mm, dz/dx and dz/dy at points in [0, 1]^2, all (N,) float64."""
         found = [np.empty(len(u)) for _ in range(3)]
-        if len(u) < FEW * math.prod(self._coefficients()[:2]):
-            spline.evaluate_net(ALL, u, v, heights, self.linear, self.pieces, *found, blocks())
-        else:
-            spline.evaluate(ALL, u, v, self.coefficients(torch.from_numpy(heights)), self.pieces, *found, blocks())
+        spline.evaluate(ALL, u, v, self.coefficients(torch.from_numpy(heights)), self.pieces, *found, blocks())
         return found
 
     def pull_at(self, u: np.ndarray, v: np.ndarray, *by: np.ndarray) -> np.ndarray:

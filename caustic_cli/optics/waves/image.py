@@ -472,9 +472,7 @@ class Imager:
         """Phase, rad, including that of the Fresnel kernel, and amplitude of each sample of a wavefront, (n, m)."""
         s, front = self.sampling, self.watched(front, line.behind)
         path, amplitude = front.on(s.low, s.step, s.count).whole
-        if path.requires_grad:
-            return phase_of(path, s, line.length, line.behind).to(dtype), amplitude.to(dtype)
-        return backend_for(path.device).phase(path, s, line.length, line.behind, dtype), amplitude.to(dtype)
+        return phase_of(path, s, line.length, line.behind).to(dtype), amplitude.to(dtype)
 
     def exposure(self, line: Line, front: Wavefront, dtype: torch.dtype) -> Exposure | PlanesExposure:
         """Power on the (subdivided) pixels as a function of a change of the optical paths of a wavefront."""

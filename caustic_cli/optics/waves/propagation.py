@@ -36,16 +36,16 @@ def ramp(sampling: Sampling, wavelength: float, axis: int, device: torch.device)
 
 
 def phase_of(path: Tensor, sampling: Sampling, length: float, behind: float, part: slice = slice(None)) -> Tensor:
-    """Phase, rad in [0, 2 pi), of samples with these optical paths, mm, including the Fresnel kernel: rows `part`, (rows, m)
+    """Phase, rad, less whole turns, of samples with these optical paths, mm, including the Fresnel kernel: rows `part`, (rows, m)
     float64.
 
     length, behind: wavelength in vacuum and in the image space, mm.
     """
-    across, along = (ramp(sampling, behind, k, path.device) for k in (0, 1))
-    phase = path * (TURN / length)  # in place from here on: allocations cost more than the sums
-    phase += across[part, None]
-    phase += along
-    return phase.remainder_(TURN)
+    across, along = (ramp(sampling, behind, k, path.device) / TURN for k in (0, 1))
+    turns = path * (1.0 / length)  # in place from here on: allocations cost more than the sums
+    turns += across[part, None]
+    turns += along
+    return turns.frac_().mul_(TURN)
 
 
 def pixel_edges(low: float, width: float, count: int, first: float, spacing: float, samples: int) -> Tensor:

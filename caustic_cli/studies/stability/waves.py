@@ -7,7 +7,7 @@ from decimal import Decimal, localcontext
 
 import torch
 
-from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.waves.propagation import phase_of
 from caustic_cli.optics.waves.sampling import Sampling
 from caustic_cli.studies.stability.case import Case
 
@@ -17,14 +17,12 @@ TURN = 2.0 * math.pi
 
 
 def long_path(millimetres: float) -> tuple[float, float]:
-    """Phase of paths of about this length, which the kernel reduces to one turn before it rounds them, rad."""
+    """Phase of paths of about this length, which are reduced to one turn before it rounds them, rad."""
     region = (-1.0, -1.0), (1.0, 1.0)
     sampling = Sampling.of(region, region, (0.1, 0.1), millimetres, (LENGTH,))
     n = sampling.count
     paths = millimetres + torch.linspace(-1e-3, 1e-3, n[0] * n[1], dtype=torch.float64).view(*n)
-    phase, none = (
-        backend_for("cpu").phase(p, sampling, LENGTH, LENGTH, torch.float32).double() for p in (paths, torch.zeros_like(paths))
-    )
+    phase, none = (phase_of(p, sampling, LENGTH, LENGTH).float().double() for p in (paths, torch.zeros_like(paths)))
     single = TURN / LENGTH * paths.float()
     naive = ours = 0.0
     with localcontext() as context:
