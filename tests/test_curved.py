@@ -16,7 +16,6 @@ from caustic_cli import cli
 from caustic_cli.config.wave_stages import without_waves
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
-from caustic_cli.export.mitsuba import write_mitsuba
 from caustic_cli.export.zemax import write_zemax
 from caustic_cli.inverse.initial_surface import _Grid, first_surface
 from caustic_cli.inverse.projection import ScreenProjection
@@ -401,11 +400,9 @@ def test_an_archive_holds_the_screen(screen, tmp_path):
     assert again.screen.curved and float(images[0].sum()) > 0.1
 
 
-def test_formats_that_cannot_say_it(tmp_path):
+def test_formats_that_say_it_in_words(tmp_path):
     scene = scene_of(screen_of(SPHERE))
     field, heights = HeightField.of(scene.lens), bumpy(scene)
-    with pytest.raises(InputError, match="not a curved screen"):
-        write_mitsuba(tmp_path / "lens.xml", scene, field, heights)
     write_zemax(tmp_path / "lens.dat", scene, field, heights)
     assert "sphere of radius 25 mm" in (tmp_path / "lens.dat").read_text()
 

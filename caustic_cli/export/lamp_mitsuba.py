@@ -16,7 +16,8 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.export.lamp import SAMPLES, lamp_parts
-from caustic_cli.export.mitsuba import BLACK, beside, camera, dielectric, file_of, screen_shape
+from caustic_cli.export.mitsuba_parts import BLACK, beside, dielectric, file_of
+from caustic_cli.export.mitsuba_screen import camera, screen_shape
 from caustic_cli.export.ply import write_mesh
 from caustic_cli.export.text import real
 from caustic_cli.io.files import write_bytes

@@ -29,9 +29,6 @@ MASK = (
     "⟨format⟩ {format} holds a lens that is clear all over, not {};"
     f" {', '.join(name for name in FORMATS if name not in (*ONE_INDEX, 'phase'))} hold its shape alone"
 )
-#: Of BEYOND_CLEAR, what Mitsuba's files hold, and what has a message of its own.
-HELD = ("mirror", "gradient index", "tilted screen", "shifted screen", "far field")
-
 #: Beyond what ONE_INDEX says.
 _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     "zemax": {"other elements": ONE_LENS, "far field": SCREEN},
@@ -46,27 +43,21 @@ _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     },
     "mitsuba": {
         "laser beam": BEAM,
-        "far field": SCREEN,
-        **dict.fromkeys(
-            [name for name in BEYOND_CLEAR if name not in HELD],
-            "⟨format⟩ mitsuba is written for clear lenses and plane screens, not {}",
-        ),
-        **dict.fromkeys(("ray file", "several sources", "user-defined source"), SOURCE),
-        "uneven plane wave": "⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written",
+        "gradient index": SHAPE,
+        "absorption": "⟨format⟩ mitsuba: its light tracer knows no media that absorb, so glass with {} cannot be written",
+        "polarisation": "⟨format⟩ mitsuba: its emitters are not polarised, so {} cannot be written",
+        **dict.fromkeys(("ray file", "ray file among sources", "user-defined source"), SOURCE),
         **dict.fromkeys(
             ("disc at infinity", "disc not Lambertian", "disc in a cone"),
             "⟨format⟩ mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at infinity; render"
             " ⟨verify⟩ mitsuba traces them all",
         ),
-        "uneven source": "⟨format⟩ mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written",
-        "line source": "⟨format⟩ mitsuba: its disc shines by its area, so one without any cannot be written",
-        "uneven points": "⟨format⟩ mitsuba: its spots shine evenly, so points of another intensity cannot be written",
     },
 }
 
 
 def _exported(format: str) -> Capability:
-    index = {"gradient index": SHAPE, "round lenslets": MASK} if format in ONE_INDEX else {}
+    index = {"gradient index": SHAPE, "round lenslets": MASK} if format in ("lighttools", "zemax") else {}
     return Capability(f"export to {format}", index | _UNSUPPORTED.get(format, {}))
 
 

@@ -36,8 +36,9 @@ SURVEY = 129
 class PlaneScreen:
     """The shape of a plane screen, in the screen's frame; curved ones are subclasses."""
 
-    #: Flat pieces along each axis by which it is represented where a plane is needed.
+    #: Flat pieces along each axis by which it is represented where a plane is needed; whether it is flat.
     pieces = 1
+    flat = True
 
     def land(self, backend, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """Landing points of rays: arguments and results as for the backend's `land`, with the screen's centre for `point`."""
@@ -46,6 +47,18 @@ class PlaneScreen:
     def at(self, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
         """S, S_x and S_y at points of a common shape, float64."""
         return [np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))] * 3
+
+    def points(self, x: np.ndarray, y: np.ndarray, middle, axes, beyond: float) -> np.ndarray:
+        """Points in space (..., 3), mm, from coordinates x, y of a common shape, of a screen with this centre and these axes;
+        beyond: see `FarField.points`."""
+        away = zip((x, y, self.at(x, y)[0]), axes, strict=True)
+        return sum((np.multiply.outer(c, axis) for c, axis in away), np.array(middle, dtype=np.float64))
+
+    def coordinates(self, points: np.ndarray, middle, axes) -> tuple[np.ndarray, np.ndarray]:
+        """The inverse of `points`, of points (3, N)."""
+        away = points - np.array(middle)[:, None]
+        x, y = (np.array(axis) @ away for axis in axes[:2])
+        return x, y
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +69,7 @@ class CurvedScreen(PlaneScreen):
     heights: Tensor | None = None
 
     pieces = 16
+    flat = False
 
     def land(self, backend, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """By intersection with the surface, whatever the backend."""
@@ -81,6 +95,21 @@ class FarField(PlaneScreen):
 
     focal: float
     centre: tuple[float, float]
+
+    flat = False
+
+    def points(self, x: np.ndarray, y: np.ndarray, middle, axes, beyond: float) -> np.ndarray:
+        """As of a plane screen: of a sphere of the radius |beyond|, mm, about the origin, on the side of the normal, or on the
+        other one where it is negative."""
+        p, q = ((c + at) / self.focal for c, at in zip((x, y), self.centre, strict=True))
+        along = math.copysign(1.0, beyond) * np.sqrt(1.0 - p * p - q * q)
+        return abs(beyond) * sum(np.multiply.outer(c, axis) for c, axis in zip((p, q, along), axes, strict=True))
+
+    def coordinates(self, points: np.ndarray, middle, axes) -> tuple[np.ndarray, np.ndarray]:
+        """As of a plane screen, of points far away."""
+        away = points / np.maximum(np.linalg.norm(points, axis=0), np.finfo(float).tiny)
+        x, y = (self.focal * (np.array(axis) @ away) - at for axis, at in zip(axes, self.centre, strict=False))
+        return x, y
 
     def land(self, backend, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """By direction alone."""

@@ -1,8 +1,9 @@
 """Verification against Mitsuba 3, an independent light tracer: statistical comparison of the two images.
 
 Mitsuba loads the exported scene (`export format mitsuba`) and sends independent rays through entrance and exit with its own
-intersections and its own `dielectric`, transmission chosen at both, weighted by its Fresnel factor; what reaches the screen is
-binned.  Light that leaves through the sides or misses the lens is lost, as in a render.
+intersections and its own `dielectric` (or `roughdielectric`), transmission chosen at both, weighted by its Fresnel factor, and
+absorbed over its own paths; what reaches the screen is binned.  Light that leaves through the sides or misses the lens is lost,
+as in a render.
 
 Notation, for each pixel, or for bins of `side` x `side` pixels with a sufficient expected number of rays
     M, R        power by Mitsuba and by the render, fractions of the source's
@@ -24,7 +25,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -38,7 +39,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
-from caustic_cli.scene.traits import BEYOND_CLEAR, Capability
+from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.independent_rays import sample_rays
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import BATCHES
@@ -55,19 +56,11 @@ LIGHT, LEAK = 4.0, 5e-5
 #: Tolerance for a better correlation of a flipped image, which for symmetric pictures differs by noise alone; and standard errors
 #: of a correlation, of which that of an even picture consists.
 TIE, ERRORS = 1e-2, 4.0
-#: What is traced of a lens beyond a clear one.
-TRACED = ("mirror", "several wavelengths", "tilted screen", "shifted screen")
 VERIFICATION = Capability(
     "comparison with Mitsuba",
     {
-        **dict.fromkeys(
-            [name for name in BEYOND_CLEAR if name not in TRACED], "⟨verify⟩ mitsuba traces clear lenses and plane screens, not {}"
-        ),
-        "round lenslets": "⟨verify⟩ mitsuba traces clear lenses and plane screens, not {}",
-        **dict.fromkeys(
-            ("ray file", "several sources", "user-defined source"),
-            "⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}",
-        ),
+        "gradient index": "⟨verify⟩ mitsuba traces straight rays, which those in {} are not",
+        "polarisation": "⟨verify⟩ mitsuba traces power without polarisation, not {}",
         "approximate Fresnel": "⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}",
     },
 )
@@ -157,6 +150,15 @@ def choose_variant() -> str:
 # tracing
 
 
+class Surface(NamedTuple):
+    """A surface in the order of light: its name in the exported scene, whether it reflects, and the absorption of the medium in
+    front of it, 1/mm."""
+
+    name: str
+    reflects: bool
+    absorption: float
+
+
 def _trace(mi, world, scene: Scene, rays: int, seed: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Power per pixel [i, j], as a fraction of the source's, and the sums of squares of the contributions of the rays."""
     rng = np.random.default_rng(seed)
@@ -164,57 +166,64 @@ def _trace(mi, world, scene: Scene, rays: int, seed: list[int]) -> tuple[np.ndar
     image, squares = np.zeros((2, *scene.screen.resolution))
     system = System.of(scene)
     receiver, own = Receiver.of(system, scene.screen), {EXIT: "mirror"} if scene.lens.mirror else {}  # the export's name of it
-    surfaces = [(own.get(e.name, e.name), e.reflects) for e in system.elements]
+    elements = [*((own.get(e.name, e.name), e.reflects) for e in system.elements), ("screen", False)]
+    surfaces = [Surface(*e, m.absorption) for e, m in zip(elements, system.media(), strict=True)]
     for start, direction, share in sample_rays(scene, rays, rng):
-        *points, weight = follow(mi, world, shapes, [*surfaces, ("screen", False)], start, direction)
-        x, y = (sum((p - o) * a for p, o, a in zip(points, receiver.middle, axis, strict=True)) for axis in receiver.axes[:2])
+        *points, weight = follow(mi, world, shapes, surfaces, start, direction, rng)
+        x, y = receiver.shape.coordinates(np.array(points, np.float64), receiver.middle, receiver.axes)
         image += _binned(x, y, weight * share, receiver)
         squares += _binned(x, y, (weight * share) ** 2, receiver)
     return image / rays, squares / rays**2
 
 
-def follow(mi, world, shapes, surfaces: list[tuple[str, bool]], start: np.ndarray, direction: np.ndarray):
+def follow(mi, world, shapes, surfaces: list[Surface], start: np.ndarray, direction: np.ndarray, rng: np.random.Generator):
     """Landing points x, y, z (mm) and weights of all rays through this sequence of surfaces; weight 0 where lost.
 
     Args:
-        shapes: of the scene, by name; surfaces: names, and whether each reflects, the screen last.
+        shapes: of the scene, by name; surfaces: the screen last.
         start: (3, N) mm; direction: (3, N) unit vectors.
+        rng: of the facets of rough surfaces.
     """
-    return (_follow if "scalar" not in mi.variant() else _follow_scalar)(mi, world, shapes, surfaces, start, direction)
+    return (_follow if "scalar" not in mi.variant() else _follow_scalar)(mi, world, shapes, surfaces, start, direction, rng)
 
 
-def _follow(mi, world, shapes, surfaces: list[tuple[str, bool]], start: np.ndarray, direction: np.ndarray):
+def _follow(mi, world, shapes, surfaces: list[Surface], start: np.ndarray, direction: np.ndarray, rng: np.random.Generator):
     """The same, all rays at a time."""
     ray = mi.Ray3f(mi.Point3f(*map(mi.Float, start)), mi.Vector3f(*map(mi.Float, direction)))
     weight, active = mi.Float(1.0), mi.Bool(True)
-    for name, reflects in surfaces:
+    for name, reflects, absorption in surfaces:
         hit = world.ray_intersect(ray, active)
         active &= hit.is_valid() & (hit.shape == mi.ShapePtr(shapes[name]))
+        if absorption:
+            weight *= mi.Float(np.exp(-absorption * np.array(hit.t, np.float64)))
         if name != "screen":
-            ray, passed = _onwards(mi, hit, active, reflects)
+            facets = mi.Point2f(*map(mi.Float, rng.random((2, start.shape[1]))))
+            ray, passed = _onwards(mi, hit, active, reflects, facets)
             weight *= passed
     return *(np.array(c) for c in (hit.p.x, hit.p.y, hit.p.z)), np.where(np.array(active), np.array(weight), 0.0)
 
 
-def _follow_scalar(mi, world, _shapes, surfaces: list[tuple[str, bool]], start: np.ndarray, direction: np.ndarray):
+def _follow_scalar(mi, world, _shapes, surfaces: list[Surface], start: np.ndarray, direction: np.ndarray, rng: np.random.Generator):
     """The same, ray by ray."""
     out = np.zeros((4, start.shape[1]))
     for k in range(start.shape[1]):
         ray, weight = mi.Ray3f(mi.Point3f(*start[:, k]), mi.Vector3f(*direction[:, k])), 1.0
-        for name, reflects in surfaces:
+        for name, reflects, absorption in surfaces:
             hit = world.ray_intersect(ray)
             if not hit.is_valid() or hit.shape.id() != name:
                 break
+            weight *= math.exp(-absorption * hit.t)
             if name == "screen":
                 out[:, k] = hit.p.x, hit.p.y, hit.p.z, weight
             else:
-                ray, passed = _onwards(mi, hit, True, reflects)
+                ray, passed = _onwards(mi, hit, True, reflects, mi.Point2f(*rng.random(2)))
                 weight *= passed
     return out
 
 
-def _onwards(mi, hit, active, reflects: bool):
-    """The transmitted ray and its transmittance, or the ray reflected by a mirror, by Mitsuba's BSDF.
+def _onwards(mi, hit, active, reflects: bool, facets):
+    """The transmitted ray and its transmittance, or the ray reflected by a mirror, by Mitsuba's BSDF; facets: two random numbers,
+    for the facet of a rough surface.
 
     Component 1 of `dielectric` is transmission; selected alone, its sample is the refracted direction and its weight the Fresnel
     transmittance, 0 for total reflection.  Importance mode: power, not radiance scaled by the index.
@@ -222,12 +231,12 @@ def _onwards(mi, hit, active, reflects: bool):
     context = mi.BSDFContext(mi.TransportMode.Importance)
     if not reflects:
         context.component = 1
-    sample, weight = hit.bsdf().sample(context, hit, 0.5, mi.Point2f(0.5), active)
+    sample, weight = hit.bsdf().sample(context, hit, 0.5, facets, active)
     return hit.spawn_ray(hit.to_world(sample.wo)), weight[0]
 
 
 def _binned(x: np.ndarray, y: np.ndarray, value: np.ndarray, receiver: Receiver) -> np.ndarray:
-    """Sum of `value` per pixel [i, j]; x, y: along the axes of the receiver from its `middle`, mm."""
+    """Sum of `value` per pixel [i, j]; x, y: its own coordinates from its `middle`, mm."""
     nx, ny = receiver.resolution
     i, j = (np.floor((c - low) / width) for c, low, width in zip((x, y), receiver.low, receiver.pixel, strict=True))
     inside = (i >= 0) & (i < nx) & (j >= 0) & (j < ny) & (value > 0)
