@@ -460,10 +460,8 @@ def test_mitsuba_meshes(tmp_path, lens, rays, capsys):
 @pytest.mark.parametrize(
     "source",
     [
-        Points(((0.0, 0.0, -50.0),), intensity="lambertian"),
         Disc(angle=0.5),
         Disc(intensity="uniform"),
-        PlaneWave(profile=np.ones((2, 2))),
     ],
 )
 def test_mitsuba_refuses_lights_it_has_not(tmp_path, lens, source):

@@ -33,14 +33,7 @@ MASK = (
 _UNSUPPORTED: dict[str, Mapping[str, str]] = {
     "zemax": {"other elements": ONE_LENS, "far field": SCREEN},
     "lighttools": {"laser beam": BEAM, "user-defined source": SOURCE, "far field": SCREEN},
-    "phase": {
-        **dict.fromkeys(
-            ("mirror", "gradient index", "other elements", "folded axis", "several sources"),
-            "⟨format⟩ phase is that of one lens for one source, not of {}",
-        ),
-        **dict.fromkeys(("ray file", "curved screen"), "⟨format⟩ phase needs a wave image, which there is none of with {}"),
-        "round lenslets": "⟨format⟩ phase is that of a lens that is clear all over, not {}",
-    },
+    "phase": dict.fromkeys(("ray file", "ray file among sources"), "⟨format⟩ phase is that of waves, and {} have none"),
     "mitsuba": {
         "laser beam": BEAM,
         "gradient index": SHAPE,

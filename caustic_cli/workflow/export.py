@@ -376,9 +376,7 @@ def files(path: Path, scene: Scene, format: str, script: bool = False, mould: bo
         return [name for p in paths for name in (p, beside(p))]
     if both:
         return paths
-    if format == "phase":
-        return [path, *_home(format).companions(path)]
-    if format == "mitsuba":
+    if format in ("phase", "mitsuba"):
         return [path, *_home(format).companions(path, scene)]
     return [path, *import_module("caustic_cli.export.lighttools_script").companions(path)] if script else [path]
 
