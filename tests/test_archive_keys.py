@@ -12,11 +12,17 @@ import torch
 from caustic_cli.commands import manpage
 from caustic_cli.export.archive_keys import KEYS
 from caustic_cli.export.lighttools import write_lighttools
+from caustic_cli.io.archive import open_archive
+from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Component, Disc, FreeForm, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.elements import FoldMirror
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.screen import Sags
 from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.gaussian import Gaussian
+from caustic_cli.scene.sources.measured_beam import MeasuredBeam
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
@@ -37,6 +43,12 @@ SCENES = {
     "plain": PLAIN,
     "profile": replace(PLAIN, source=PlaneWave(profile=np.ones((3, 4))), light=Light(polarisation=30.0, unit="lm")),
     "tilted": replace(PLAIN, source=PlaneWave(tilt=(20.0, 0.0))),
+    "beam": replace(PLAIN, source=Gaussian((1.0, 2.0), 633.0, -40.0, 1.5)),
+    "measured beam": replace(PLAIN, source=MeasuredBeam(np.zeros((5, 6)), 633.0)),
+    "far": replace(PLAIN, screen=replace(SCREEN, far=True, z=1000.0)),
+    "radial": replace(PLAIN, lens=replace(LENS, gradient=Gradient("radial", (-1e-3,)))),
+    "volume": replace(PLAIN, lens=replace(LENS, gradient=Gradient("volume", volume=np.full((4, 5, 3), 1.5)))),
+    "round lenslets": replace(PLAIN, lens=replace(LENS, array=(2, 3), control=(11, 10), lenslets="round")),
     "sun": replace(PLAIN, source=Disc(angle=0.5, brightness=np.ones((3, 5)))),
     "grid": replace(PLAIN, source=Points(((0.0, 0.0, -30.0), (1.0, 0.0, -30.0)), kind="grid", intensity=TABLE)),
     "disc": replace(PLAIN, source=Disc(), light=Light(wavelengths=(500.0, 600.0), measure=LED, efficacy=300.0)),
@@ -110,3 +122,27 @@ def test_the_manual_lists_them():
     section = manpage.build().split(".SH LIGHTTOOLS ARCHIVE")[1].split(".SH ")[0]
     assert re.findall(r"^\\fB(\w+)\\fR", section, re.M) == list(ALL)
     assert re.findall(r"^\.SS (.*)$", section, re.M) == list(KEYS)
+
+
+@pytest.mark.parametrize("name", ["beam", "measured beam", "far", "radial", "volume", "round lenslets"])
+def test_such_scenes_come_back(name, tmp_path):
+    """Light that their archives send through the lens lands where that of the scenes does."""
+    scene = SCENES[name]
+    if name == "measured beam":
+        scene = replace(scene, source=replace(scene.source, phase=np.add.outer(np.arange(5.0) ** 2, np.arange(6.0)) / 9.0))
+    if name == "far":
+        scene = replace(scene, screen=replace(scene.screen, size=(200.0, 160.0)))
+    if name == "volume":
+        ramp = 1.5 + 3e-4 * np.arange(60.0).reshape(4, 5, 3)
+        scene = replace(scene, lens=replace(scene.lens, gradient=Gradient("volume", volume=ramp)))
+    field = HeightField.of(scene.lens)
+    x, y = field.control_xy()
+    heights = 5.0 + 0.01 * (x[:, None] ** 2 + x[:, None] * y[None, :])
+    write_lighttools(tmp_path / "a.npz", scene, field, heights)
+    again = open_archive(tmp_path / "a.npz")
+    images = [expose(*lens, rays_of(lens[0], "stratified", 5000)).image for lens in ((scene, field, heights), again)]
+    assert float(images[0].sum()) > 0.3
+    assert images[1].numpy() == pytest.approx(images[0].numpy(), abs=1e-7)
+    plain = replace(scene, source=PLAIN.source, screen=PLAIN.screen, lens=replace(scene.lens, gradient=None, array=(1, 1)))
+    other = expose(plain, field, heights, rays_of(plain, "stratified", 5000)).image
+    assert float((other - images[0]).abs().sum()) > 1e-3

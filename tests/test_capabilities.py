@@ -116,6 +116,7 @@ SCENES: dict[str, Scene] = {
     "separate places": of(Several((PlaneWave(), Points((AT,))), (NONE, NONE))),
     "uneven plane wave": of(PlaneWave(profile=np.array([[1.0, 2.0], [3.0, 4.0]]))),
     "uneven source": of(Disc(AT, brightness=np.array([[1.0, 2.0], [3.0, 4.0]]))),
+    "uneven directions": of(Disc(angle=0.5, brightness=np.array([[1.0, 2.0], [3.0, 4.0]]))),
     "tabulated intensity": of(Points((AT,), intensity=Distribution((0.0, 90.0), (1.0, 0.5)))),
     "uneven points": of(Points((AT,), intensity="lambertian")),
     "disc at infinity": of(Disc(angle=0.5)),

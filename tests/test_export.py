@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import time
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,12 +19,14 @@ from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.stl import TRIANGLE, write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
+from caustic_cli.export.zemax import write_zemax
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene import Component, FoldMirror, Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
 
 UNEVEN = (0.0, 0.0, 0.0, 0.0, 0.11, 0.2, 0.2, 0.55, 0.83, 1.0, 1.0, 1.0, 1.0)  # cubic, one double knot
 
@@ -363,3 +367,30 @@ def test_stl_refuses_a_surface_below_its_entrance(tmp_path):
     scene, field, heights = make()
     with pytest.raises(InputError, match="above the entrance"):
         write_stl(tmp_path / "lens.stl", scene, field, heights - 6.0)
+
+
+def test_zemax_says_what_it_does_not_contain(tmp_path):
+    """The grid is that of the surface alone, whatever the scene; comments say the rest, and the positions of round lenslets."""
+    scene, field, heights = make(control=(28, 19), size=(10.0, 8.0))
+    scene = replace(scene, screen=replace(scene.screen, z=1000.0))
+
+    def lines(one, *surface):
+        write_zemax(tmp_path / "a.dat", one, *(surface or (field, heights)), (9, 9))
+        text = (tmp_path / "a.dat").read_text().splitlines()
+        return [t for t in text if t.startswith("!")], [t for t in text if not t.startswith("!")]
+
+    said, grid = lines(scene)
+    for changes, words in (
+        ({"screen": replace(scene.screen, far=True)}, "far field (afocal image space)"),
+        ({"elements": (Component(60.0, (30.0, 30.0)),)}, "among other elements"),
+        ({"elements": (FoldMirror(60.0, (80.0, 80.0), tilt=(45.0, 0.0)),)}, "which flat mirrors fold"),
+        ({"lens": replace(scene.lens, gradient=Gradient("radial", (-1e-3,)))}, "- 0.001 r^2, r in mm from the axis"),
+    ):
+        comments, found = lines(replace(scene, **changes))
+        assert found == grid and words in " ".join({*comments} - {*said})
+    lens = replace(scene.lens, array=(3, 2), lenslets="round")
+    (*_, comment), _ = lines(replace(scene, lens=lens), HeightField.of(lens), torch.full((28, 19), 5.0, dtype=torch.float64))
+    radius, *centres = map(float, re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", comment.partition("radius")[2]))
+    assert radius == pytest.approx(10.0 / 6.0)
+    wanted = [(10 / 3 * (i - 1), 4 * (j - 0.5)) for i in range(3) for j in range(2)]
+    assert np.reshape(centres, (-1, 2)) == pytest.approx(np.array(wanted))

@@ -49,7 +49,9 @@ from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Component, Disc, FreeForm, Offset, PlaneWave, Points, Scene
+from caustic_cli.scene import Component, Disc, FreeForm, Light, Offset, PlaneWave, Points, Scene
+from caustic_cli.scene.materials import nearest_index
+from caustic_cli.scene.sources.several import Several
 
 LIMIT = 1e-3  # mm on a screen 300 mm away
 CASE = {"control": (22, 16), "size": (10.0, 8.0), "relief": 0.03}
@@ -509,14 +511,88 @@ def test_the_lighttools_script_builds_this_lens(tmp_path, lens, rays, source, mo
     error = off(scene, rays, *through(points[:, 0, 0], points[0, :, 1], points[..., 2], rays))
     say(capsys, "lighttools script", error)
     assert error < LIMIT
-    sources = 2 if isinstance(source, Points) else 1
+    sources = 2 if isinstance(source, Points) else 32 if source.kind == "disc" and not source.distant else 1
     assert len(calls["MakeSourceSurfaceCube"]) == len(calls["SetSourcePower"]) == sources
+    assert {c[5:] for c in calls["MakeSourceSurfaceCube"]} == {(0, 0, 0, 0, 0, -1)}  # the face towards +z, which is its "right"
     assert sum(c[2] for c in calls["SetSourcePower"]) == pytest.approx(1.0)
     mesh = {c[1]: c[2] for c in calls["DbSet"]}
     assert (mesh["X_Dimension"], mesh["Y_Dimension"], mesh["Max_X_Bound"], mesh["Do_Noise_Reduction"]) == (64, 50, 19.2, "No")
     assert mesh["MaxProgress"] == 1000 and any("BeginAllSimulations" in c[0] for c in calls["Cmd"])
     assert np.load(tmp_path / "lens-lighttools.npy").shape == (64, 50)
     assert all(is_ours(p) for p in companions(path))
+
+
+def scripted(tmp_path, monkeypatch, scene, field, heights):
+    """What LightTools is told by the script of a scene, by the names of the calls; and the images that it writes."""
+    write_lighttools(tmp_path / "lens.npz", scene, field, heights, samples=(9, 6))
+    write_script(tmp_path / "lens.npz", scene, field, heights, samples=(9, 6))
+    fake, client, package = FakeLightTools(), types.ModuleType("win32com.client"), types.ModuleType("win32com")
+    client.Dispatch, package.client = (lambda name: fake), client
+    monkeypatch.setitem(sys.modules, "win32com", package)
+    monkeypatch.setitem(sys.modules, "win32com.client", client)
+    monkeypatch.setattr(sys, "argv", ["lens.py", "1e3"])
+    script = companions(tmp_path / "lens.npz")[0]
+    exec(compile(script.read_text(), script, "exec"), {"__name__": "__main__", "__file__": str(script)})
+    return {name: [c[1:] for c in fake.calls if c[0] == name] for name in {c[0] for c in fake.calls}}, np.load(
+        tmp_path / "lens-lighttools.npy"
+    )
+
+
+def shone(calls) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Middles (N, 3) and widths (N, 2) of the sources, mm, and their powers (N,)."""
+    at, cubes = np.array([c[2:] for c in calls["MoveVector"]]), calls["MakeSourceSurfaceCube"]
+    return at, np.array([(wide, high) for _, high, wide, *_ in cubes]), np.array([c[2] for c in calls["SetSourcePower"]])
+
+
+@pytest.mark.parametrize(
+    ("source", "variances"),
+    [
+        (Disc((1.0, -2.0, -60.0), (4.0, 2.0)), (1.0, 0.25)),  # of an ellipse a^2 / 4 and b^2 / 4
+        (Disc((1.0, -2.0, -60.0), (4.0, 0.0)), (1.0, 0.0)),
+        (Disc((1.0, -2.0, -60.0), (4.0, 2.0), brightness=np.ones((100, 3))), (16.0 / 12.0, 4.0 / 12.0)),
+        (PlaneWave(profile=np.ones((5, 70))), None),
+    ],
+)
+def test_a_source_of_the_script_has_its_extent(tmp_path, lens, monkeypatch, source, variances):
+    """Powers, centroids and variances of what shines are those of closed forms."""
+    scene = replace(lens[0], source=source)
+    half = scene.lens.half_size
+    calls, _ = scripted(tmp_path, monkeypatch, scene, *lens[1:])
+    at, size, power = shone(calls)
+    assert power.sum() == pytest.approx(1.0) and len(power) <= 32 * 32
+    for k, wanted in enumerate(variances or (half[0] ** 2 / 3.0, half[1] ** 2 / 3.0)):
+        middle = (power * at[:, k]).sum()
+        assert middle == pytest.approx(0.0 if source.distant else source.position[k], abs=1e-6)
+        assert (power * ((at[:, k] - middle) ** 2 + size[:, k] ** 2 / 12.0)).sum() == pytest.approx(wanted, rel=5e-3, abs=1e-6)
+
+
+def test_a_profile_of_the_script_is_where_it_is(tmp_path, lens, monkeypatch):
+    """Also one of more cells than the script has, whose sums over equal parts are kept."""
+    for light in (np.array([[1.0, 0.0, 2.0], [0.5, 3.0, 1.0]]), np.random.default_rng(1).random((96, 64))):
+        calls, _ = scripted(tmp_path, monkeypatch, replace(lens[0], source=PlaneWave(2.0, light)), *lens[1:])
+        at, _, power = shone(calls)
+        (n, m), (rx, ry) = (min(k, 32) for k in light.shape), lens[0].lens.half_size
+        i, j = np.floor((at[:, 0] / rx + 1.0) / 2.0 * n).astype(int), np.floor((at[:, 1] / ry + 1.0) / 2.0 * m).astype(int)
+        found = np.zeros((n, m))
+        found[i, j] = power
+        sums = light.reshape(n, light.shape[0] // n, m, light.shape[1] // m).sum((1, 3))
+        assert found == pytest.approx(2.0 * sums / sums.sum())
+
+
+def test_the_script_runs_each_source_and_each_wavelength(tmp_path, lens, monkeypatch):
+    light = Light(wavelengths=(450.0, 650.0), weights=(1.0, 3.0), unit="lm")
+    sources = Several((PlaneWave(2.0), Disc((0.0, 0.0, -60.0), power=3.0)), ((light.wavelengths, light.weights),) * 2)
+    scene, field, heights = lens
+    scene = replace(scene, source=sources, light=light, lens=replace(scene.lens, glass="N-BK7"))
+    scene = replace(scene, screen=replace(scene.screen, shift=(3.0, -1.5)))
+    calls, image = scripted(tmp_path, monkeypatch, scene, field, heights)
+    assert len(calls["NewV3D"]) == 4 and image.shape == (4, *scene.screen.resolution)
+    powers = np.array([c[2] for c in calls["SetSourcePower"]])
+    assert powers[:2] == pytest.approx([0.5, 1.5]) and powers[2:34].sum() == pytest.approx(0.75)
+    assert powers[34:].sum() == pytest.approx(2.25)
+    given = [c[2] for c in calls["DbSet"] if c[1] == "Refractive_Index"]
+    assert given == pytest.approx([nearest_index("N-BK7", w) for w in (*light.wavelengths, *light.wavelengths)])
+    assert [c[1:4] for c in calls["MakeDummyPlane"]] == [(3.0, -1.5, scene.screen.z)] * 4
 
 
 def test_the_lighttools_script_builds_both_sides(tmp_path, lens, monkeypatch):
@@ -534,8 +610,8 @@ def test_the_lighttools_script_builds_both_sides(tmp_path, lens, monkeypatch):
     exec(compile(script.read_text(), script, "exec"), held)
     archive = dict(np.load(tmp_path / "lens.npz", allow_pickle=False))
     fake = FakeLightTools()
-    held["build_lens"](fake, archive)
-    held["build_source"](fake, fake, archive)
+    held["build_lens"](fake, archive, 1.5)
+    held["build_source"](fake, fake, archive, 1.0)
     x, y = (np.linspace(-r, r, n) for r, n in zip(scene.lens.half_size, (31, 22), strict=True))
     over = zip((31, 22), knots, (3, 2), strict=True)
     u, v = (BSpline.design_matrix(np.linspace(0.0, 1.0, n), t, p).toarray() for n, t, p in over)

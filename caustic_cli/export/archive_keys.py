@@ -44,6 +44,14 @@ KEYS: dict[str, tuple[Key, ...]] = {
         Key("fresnel", "", "text", "none or schlick; only if reflection losses are not exact"),
         Key("aperture", "", "text", "circle; only if it is not a rectangle"),
         Key("mirror", "", "whole", "1; only if the surface reflects"),
+        Key("gradient", "", "text", "selfoc, radial, axial or volume, whose terms and values are as of ⟨lens.gradient⟩; only if the"
+            " index varies"),
+        Key("gradient_terms", "(k,)", "mm^-i", "coefficients of its formula"),
+        Key("gradient_volume", "(a, b, k)", "1", "control values of the index over aperture and thickness"),
+        Key("lenslets", "(2,)", "whole", "numbers of round lenslets along x and y; only of such, between which it is opaque"),
+        Key("lenslet_packing", "", "text", "square or hexagonal"),
+        Key("lenslet_centres", "(k, 2)", "mm", "their centres"),
+        Key("lenslet_radius", "", "mm", "radius of each"),
         Key("entrance_control_points", "(c, d, 3)", "mm", "of a free-form entrance, as of the exit; only with one, as the next 3"),
         Key("entrance_degrees", "(2,)", "whole", "of its B-spline along x and y"),
         Key("entrance_knots_u", "(e,)", "1", "its knots along x on [0, 1]"),
@@ -53,6 +61,7 @@ KEYS: dict[str, tuple[Key, ...]] = {
         Key("screen_half_size", "(2,)", "mm", "half width and half height", True),
         Key("z_screen", "", "mm", "position of its centre", True),
         Key("resolution", "(2,)", "whole", "pixels along x and y", True),
+        Key("screen_far", "", "whole", "1; only of the far field, where light of the direction cosines q lands at |z_screen| q"),
         Key("screen_tilt", "(2,)", "degrees", "rotations about x, then about y; only if not 0"),
         Key("screen_turn", "", "degrees", "rotation about its normal, before its tilt; only if not 0"),
         Key("screen_shift", "(2,)", "mm", "decentre along x and y; only if not 0"),
@@ -61,7 +70,7 @@ KEYS: dict[str, tuple[Key, ...]] = {
         Key("screen_sag_half_size", "(2,)", "mm", "half width and half height of that grid"),
     ),
     "Source": (
-        Key("source_type", "", "text", "plane, point, grid, disc, rays, or several", True),
+        Key("source_type", "", "text", "plane, point, grid, disc, rays, gaussian, measured, or several", True),
         Key("source_positions", "(k, 3)", "mm", "points, centre of a disc, or point where the rays of a file are closest to each"
             " other; none, k = 0, at infinity; not of several sources, as the next two"),
         Key("source_power", "(k,)", "W or lm", "of each point; k = 1 for all others, of which those at infinity have it through"
@@ -75,6 +84,11 @@ KEYS: dict[str, tuple[Key, ...]] = {
         Key("source_brightness", "(a, b)", "1", "relative radiance over the rectangle around a disc; only if a picture gives it"),
         Key("source_intensity", "", "text", "uniform, lambertian or table; of points and discs at a finite distance"),
         Key("source_intensity_table", "(k, 2)", "degrees and 1", "angles and relative intensities; only with table"),
+        Key("source_wavelength", "", "nm", "of a laser beam, by which it diverges"),
+        Key("source_waist", "(2,)", "mm", "radii of a Gaussian beam along x and y, where the irradiance is 1/e² of its peak"),
+        Key("source_waist_at", "", "mm", "position of its waist behind the entrance"),
+        Key("source_m2", "", "1", "its beam quality factor M²"),
+        Key("source_phase", "(a, b)", "rad", "phase of a measured beam over the aperture, not wrapped"),
         Key("source_rays_sha256", "", "text", "SHA-256 of the rays of a file, which the archive does not contain"),
         Key("source_count", "(1,)", "whole", "number of sources; only of several"),
         Key("source_K_NAME", "", "as NAME", "of several sources the key source_NAME, or cone_half_angle, of the K-th, and its"

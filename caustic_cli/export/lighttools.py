@@ -55,8 +55,9 @@ def write_lighttools(
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
     screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_sources`; fresnel unless exact; aperture if a circle;
-    mirror, 1, of one; those of `_glass`, `_light` and `_elements`; those of `_entrance` where it is free-form; control_points
-    (n, m, 3) with x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit, format_version, created_by.
+    mirror, 1, of one; those of `_gradient`, `_lenslets`, `_glass`, `_light` and `_elements`; those of `_entrance` where it is
+    free-form; control_points (n, m, 3) with x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit,
+    format_version, created_by.
 
     Args:
         heights: (n, m) control heights, mm.
@@ -89,6 +90,8 @@ def write_lighttools(
         **_screen(scene.screen),
         **_sources(scene),
         **{key: np.array(value) for key, value, usual in _unusual(scene.lens) if value != usual},
+        **_gradient(scene.lens),
+        **_lenslets(scene.lens),
         **_glass(scene.lens),
         **_light(scene.light),
         "control_points": np.asfortranarray(control_points(field, net)),
@@ -163,6 +166,30 @@ def _glass(lens: Lens) -> dict[str, np.ndarray]:
     return found if lens.glass is None else found | {"glass": np.array(lens.glass)}
 
 
+def _gradient(lens: Lens) -> dict[str, np.ndarray]:
+    """Optional keys of an index that varies: gradient, the word of its formula or volume, with gradient_terms (k,), mm^-i, or
+    gradient_volume (a, b, k), control values of the index; see `scene.gradient`."""
+    given = lens.gradient
+    if given is None:
+        return {}
+    if given.volume is not None:
+        return {"gradient": np.array(given.kind), "gradient_volume": _reals(given.volume)}
+    return {"gradient": np.array(given.kind), "gradient_terms": _reals(given.terms)}
+
+
+def _lenslets(lens: Lens) -> dict[str, np.ndarray]:
+    """Optional keys of round lenslets, between which it is opaque: lenslets (2,), their numbers along x and y, lenslet_packing, and
+    lenslet_centres (k, 2) and lenslet_radius, mm."""
+    if not lens.round_lenslets:
+        return {}
+    return {
+        "lenslets": np.array(lens.array, np.int64),
+        "lenslet_packing": np.array(lens.packing),
+        "lenslet_centres": _reals(lens.cells.centres),
+        "lenslet_radius": _reals(lens.cells.radius),
+    }
+
+
 def _light(light: Light) -> dict[str, np.ndarray]:
     """Optional keys of the light: source_power_unit, unless W; source_wavelengths (k,), nm, with source_weights (k,); where they
     are samples of a continuous spectrum, source_spectrum (m, 2), nm and relative power per nm, and source_detector, eye or power;
@@ -232,12 +259,15 @@ def _elements(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _screen(screen: Screen) -> dict[str, np.ndarray]:
-    """Optional keys of the screen: `screen_tilt` (2,) and `screen_turn`, degrees, `screen_shift` (2,), mm, and of a curved one
+    """Optional keys of the screen: `screen_far`, 1, of the far field, whose lengths are those in the focus of a lens of the focal
+    length |z_screen|; `screen_tilt` (2,) and `screen_turn`, degrees, `screen_shift` (2,), mm, and of a curved one
     `screen_curvature` (2,), 1/mm along x and y, 0 along a cylinder, or `screen_sag` (a, b), mm along its normal, [i, j] on a
     regular grid over `screen_sag_half_size` (2,), mm about its centre."""
     (*tilt, turn), shift = (*screen.tilt, 0.0)[:3], screen.shift
     found = {key: _reals(value) for key, value in (("tilt", tilt), ("turn", turn), ("shift", shift)) if np.any(value)}
     found = {f"screen_{key}": value for key, value in found.items()}
+    if screen.far:
+        found["screen_far"] = np.array(1, np.int64)
     if screen.rounded:
         found["screen_curvature"] = 1.0 / _reals(screen.radius)
     if screen.sags is not None:
@@ -321,8 +351,31 @@ def _of_rays(scene: Scene) -> dict[str, np.ndarray]:
     return {"cone_half_angle": cone, "source_rays_sha256": np.array(source.rays.digest)} | _tilt(source)
 
 
+def _of_beam(scene: Scene) -> dict[str, np.ndarray]:
+    """Keys of a Gaussian beam: source_wavelength, nm, source_waist (2,) and source_waist_at, mm, and source_m2."""
+    beam = scene.source
+    size = {"source_waist": _reals(beam.waist), "source_waist_at": _reals(beam.waist_at), "source_m2": _reals(beam.m2)}
+    return {"cone_half_angle": _reals(0.0), "source_wavelength": _reals(beam.wavelength), **size} | _tilt(beam)
+
+
+def _of_measured(scene: Scene) -> dict[str, np.ndarray]:
+    """Keys of a measured beam: source_wavelength, nm, source_phase (a, b), rad over the aperture [i, j], and source_profile."""
+    beam = scene.source
+    light = {} if beam.profile is None else {"source_profile": _reals(beam.profile)}
+    found = {"source_wavelength": _reals(beam.wavelength), "source_phase": _reals(beam.phase)}
+    return {"cone_half_angle": _reals(0.0)} | found | light
+
+
 #: Further keys of a source, by its kind.
-_KEYS = {"plane": _of_plane, "point": _of_points, "grid": _of_points, "disc": _of_disc, "rays": _of_rays}
+_KEYS = {
+    "plane": _of_plane,
+    "point": _of_points,
+    "grid": _of_points,
+    "disc": _of_disc,
+    "rays": _of_rays,
+    "gaussian": _of_beam,
+    "measured": _of_measured,
+}
 
 
 def _reals(value) -> np.ndarray:

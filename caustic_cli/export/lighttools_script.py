@@ -1,7 +1,8 @@
 """Import into LightTools: a Python script that rebuilds the scene from the `.npz`, and a block of points.
 
     NAME.py        attaches to a running LightTools by COM (pywin32), builds lens, source, receiver and simulation from NAME.npz,
-                   runs it, and writes the illuminance as NAME-lighttools.npy, [i, j]
+                   runs it, and writes the illuminance as NAME-lighttools.npy, [i, j], or [k, i, j] of several simulations: one for
+                   each source, and each index
     NAME.lts.txt   the two `restorePoints` blocks of a FreeformSolid in an `.lts` model, front and rear, x varying fastest,
                    to be pasted into a model in place of its own: for those without COM
 
@@ -20,7 +21,7 @@ from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import atomic_file, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Band, Scene
 
 #: Points of a flat entrance along each axis.
 FLAT = 5
@@ -32,7 +33,8 @@ SCRIPT = '''"""@CREATED@ for the model @NPZ@: run it on Windows while LightTools
     pip install pywin32 numpy
     python @NAME@
 
-Builds the lens, its source, a receiver on the screen and the simulation in a new model; millimetres.
+Builds the lens, its source, a receiver on the screen and the simulation in a new model; millimetres.  Each of several sources, and
+each wavelength in a dispersive glass, has a model and a simulation of its own, and an image [k, i, j].
 """
 
 import sys
@@ -42,7 +44,9 @@ import numpy as np
 
 HERE = Path(__file__).resolve().parent
 RAYS = int(float(sys.argv[1])) if len(sys.argv) > 1 else 1_000_000
-BEFORE = 1.0  # a plane wave starts so far before all of the entrance, mm
+BEFORE = 1.0  # light from infinity starts so far before all of the entrance, mm
+POINT, STRIPS, CELLS = 1e-6, 32, 32  # width of a point, mm; strips of a disc; cells of a picture along each axis
+RUNS = @RUNS@  # number of the source, refractive index and part of the power of each simulation
 SURFACE = ("LENS_MANAGER[1].COMPONENTS[Components].SOLID[{}].FREEFORM_PRIMITIVE[FreeformPrimitive_1]"
            ".FREEFORM_SURFACE[{}]")
 MESH = "RECEIVER[screen].MESH[1]"
@@ -56,16 +60,28 @@ def main():
     js = win32com.client.Dispatch("LTCOM64.JSNET")
     for name in ("ShowDialogs", "ShowFileDialogBox", "ConfirmDeleteModel"):
         lt.SetOption(name, 0)
-    lt.Begin()
-    js.NewV3D(lt)
-    build_lens(lt, lens)
-    build_source(lt, js, lens)
-    build_receiver(lt, js, lens)
-    lt.End()
-    simulate(lt, lens)
+    images = []
+    for source, index, part in RUNS:
+        lt.Begin()
+        js.NewV3D(lt)
+        build_lens(lt, lens, index)
+        build_source(lt, js, member(lens, source), part)
+        build_receiver(lt, js, lens)
+        lt.End()
+        images.append(simulate(lt, lens))
+    image = np.array(images) if len(images) > 1 else images[0]
+    np.save(HERE / "@STEM@-lighttools.npy", image)
+    print("illuminance: sum %.9g, saved" % image.sum())
 
 
-def build_lens(lt, lens):
+def member(lens, number):
+    """The archive with the keys of one of several sources in place of those of all; 0 for a single one."""
+    own = "source_%d_" % number
+    found = {key[len(own):]: value for key, value in lens.items() if key.startswith(own)}
+    return lens | {key if key == "cone_half_angle" else "source_" + key: value for key, value in found.items()}
+
+
+def build_lens(lt, lens, index):
     """A FreeformSolid between the points of the entrance and those of the exit surface, u = x, v = y."""
     lt.Cmd("FreeformSolid XYZ 0,0,0 XYZ 0,0,1 XYZ 0,1,0")
     name = got(lt.DbGet("SOLID[@Last]", "Name"))
@@ -73,7 +89,6 @@ def build_lens(lt, lens):
     for surface, grid in (("FrontSurface", entrance(lens)), ("RearSurface", rear)):
         lt.SetFreeformSurfacePoints(SURFACE.format(name, surface), grid.tolist(), grid.shape[0], grid.shape[1])
     lt.DbSet("SOLID[@Last]", "Name", "lens")
-    index = float(lens["refractive_index"])
     if lt.DbSet("SOLID[lens]", "Refractive_Index", index):
         print("please give the solid `lens` a material of index %.9g by hand" % index)
 
@@ -101,28 +116,55 @@ def basis(t, degree, at):
     return found
 
 
-def build_source(lt, js, lens):
-    """A plane wave as a collimated rectangle, points and discs aimed into their cone."""
-    kind, before = lens["source_type"].item(), float(entrance(lens)[..., 2].min()) - BEFORE
-    (rx, ry), cone = lens["lens_half_size"], float(lens["cone_half_angle"])
-    if kind == "plane":
-        place(lt, js, "light", (0.0, 0.0, before), (2 * rx, 2 * ry), float(lens["source_power"][0]), 0.0)
-        return
-    if "source_angle" in lens:
-        place(lt, js, "light", (0.0, 0.0, before), (2 * rx, 2 * ry), float(lens["source_power"][0]), cone)
-        return
-    size = lens.get("source_size", np.full(2, 1e-6))  # a point is a tiny square
-    for k, (position, power) in enumerate(zip(lens["source_positions"], lens["source_power"])):
-        place(lt, js, "light%d" % (k + 1), position, size, float(power), cone,
-              "Cosine" if lens["source_intensity"].item() == "lambertian" else "Uniform")
+def build_source(lt, js, lens, part):
+    """Each place of the source as rectangles that shine along +z, into their cone; part: of its power."""
+    cone, apodizer = float(lens["cone_half_angle"]), "Uniform"
+    if len(lens["source_positions"]):
+        apodizer = "Cosine" if lens["source_intensity"].item() == "lambertian" else "Uniform"
+        places = zip(lens["source_positions"], lens["source_power"])
+    else:
+        places = [((0.0, 0.0, float(entrance(lens)[..., 2].min()) - BEFORE), lens["source_power"][0])]
+    pieces, number = tiles(lens), 0
+    for (x, y, z), power in places:
+        for (dx, dy), size, share in pieces:
+            number += 1
+            place(lt, js, "light%d" % number, (x + dx, y + dy, z), size, float(power) * part * share, cone, apodizer)
 
 
-def place(lt, js, name, position, size, power, cone, apodizer="Uniform"):
-    """A cube source whose +z face alone shines, so thin that it stands at `position`, into a cone of half-angle `cone`."""
+def tiles(lens):
+    """What shines at a place: centres, widths and parts of the power of rectangles, mm.  The whole aperture, or the cells of a
+    profile over it; the cells of a picture of a disc, at most CELLS along each axis; strips of a disc, each as wide as it is there;
+    a tiny square for a point."""
+    distant = not len(lens["source_positions"])
+    cells = lens.get("source_profile", np.ones((1, 1))) if distant else lens.get("source_brightness")
+    half = lens["lens_half_size"] if distant else lens.get("source_size", np.full(2, POINT)) / 2
+    if cells is not None:
+        for axis in (0, 1):
+            count = cells.shape[axis]
+            at = np.linspace(0.0, count, min(CELLS, count) + 1)  # sums over equal parts, which may cut cells
+            sums = np.insert(np.cumsum(cells, axis), 0, 0.0, axis)
+            cells = np.diff(np.apply_along_axis(lambda c: np.interp(at, np.arange(count + 1), c), axis, sums), axis=axis)
+        across = [r * ((2 * np.arange(n) + 1) / n - 1) for r, n in zip(half, cells.shape)]
+        size = [2 * max(r, POINT / 2) / n for r, n in zip(half, cells.shape)]
+        return [((x, y), size, cells[i, j] / cells.sum()) for i, x in enumerate(across[0])
+                for j, y in enumerate(across[1]) if cells[i, j] > 0]
+    if "source_size" not in lens:
+        return [((0.0, 0.0), (POINT, POINT), 1.0)]
+    turn = np.linspace(0.0, np.pi, STRIPS + 1)  # of a circle, between whose chords lie the strips
+    areas = np.diff(turn - np.sin(2 * turn) / 2)
+    low, high = -np.cos(turn[:-1]), -np.cos(turn[1:])
+    wide = areas / (high - low)
+    return [((0.0, half[1] * y), (max(half[0] * w, POINT), max(half[1] * h, POINT)), a / np.pi)
+            for y, w, h, a in zip((low + high) / 2, wide, high - low, areas)]
+
+
+def place(lt, js, name, position, size, power, cone, apodizer):
+    """A cube source whose +z face alone shines (the last of its six), so thin that it stands at `position`, into a cone of
+    half-angle `cone`.  Powers are watts here, or the lumens of the archive in their place."""
     x, y, z = (float(v) for v in position)
     depth = 1e-6
-    js.MakeSourceSurfaceCube(lt, float(size[1]), float(size[0]), depth, name, 0, 0, 0, 1, 0, 0)
-    js.MoveVector(lt, name, x, y, z - depth / 2)
+    js.MakeSourceSurfaceCube(lt, float(size[1]), float(size[0]), depth, name, 0, 0, 0, 0, 0, -1)
+    js.MoveVector(lt, name, x, y, z - depth)
     js.SetSourceAimSphere(lt, name, "Aim Region", "Yes", 0, 0, 0, max(cone, 1e-6))
     js.SetSourcePower(lt, name, power, "watts", "Automatic")
     lt.DbSet(name, "Direction_Apodizer_Type", apodizer)
@@ -131,7 +173,8 @@ def place(lt, js, name, position, size, power, cone, apodizer="Uniform"):
 def build_receiver(lt, js, lens):
     """The screen's pixels, without LightTools' smoothing, which is on by default."""
     (sx, sy), z, (nx, ny) = lens["screen_half_size"], float(lens["z_screen"]), lens["resolution"]
-    js.MakeDummyPlane(lt, 0, 0, z, 0, 0, -1, "N", "Rectangular", float(2 * sx), float(2 * sy), "screen_plane")
+    x, y = (float(c) for c in lens.get("screen_shift", np.zeros(2)))
+    js.MakeDummyPlane(lt, x, y, z, 0, 0, -1, "N", "Rectangular", float(2 * sx), float(2 * sy), "screen_plane")
     js.MakeReceiver(lt, "screen_plane", "dummyplane", "screen")
     for field, value in (("X_Dimension", int(nx)), ("Y_Dimension", int(ny)), ("Min_X_Bound", -float(sx)),
                          ("Max_X_Bound", float(sx)), ("Min_Y_Bound", -float(sy)), ("Max_Y_Bound", float(sy)),
@@ -143,9 +186,7 @@ def simulate(lt, lens):
     """Trace RAYS rays; the receiver's illuminance, W/mm2, as an array [i, j]."""
     lt.DbSet("LENS_MANAGER[1].ILLUM_MANAGER[Illumination_Manager].SIMULATIONS[ForwardAll]", "MaxProgress", RAYS)
     lt.Cmd("\\\\V3D BeginAllSimulations")
-    image = np.array(got(lt.GetMeshData(MESH, np.zeros(tuple(lens["resolution"])).tolist(), "CellValue")))
-    np.save(HERE / "@STEM@-lighttools.npy", image)
-    print("illuminance: sum %.9g, saved" % image.sum())
+    return np.array(got(lt.GetMeshData(MESH, np.zeros(tuple(lens["resolution"])).tolist(), "CellValue")))
 
 
 def got(answer):
@@ -176,12 +217,28 @@ def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Te
     """
     path = Path(path)
     script, block = companions(path)
-    words = {"@CREATED@": CREATED, "@NPZ@": path.name, "@NAME@": script.name, "@STEM@": path.stem, "@FLAT@": str(FLAT)}
+    runs = [
+        f"({0 if band.member is None else band.member + 1}, {real(band.scene.lens.index)}, {real(part)})"
+        for band, part in _parts(scene)
+    ]
+    words = {
+        "@CREATED@": CREATED,
+        "@RUNS@": f"({', '.join(runs)},)",
+        "@NPZ@": path.name,
+        "@NAME@": script.name,
+        "@STEM@": path.stem,
+        "@FLAT@": str(FLAT),
+    }
     text = SCRIPT
     for word, value in words.items():
         text = text.replace(word, value.replace("\\", "\\\\").replace('"', '\\"'))
     write_bytes(script, text.encode())
     _write_block(block, _entrance(scene, samples), sample_grid(field, heights, samples))
+
+
+def _parts(scene: Scene) -> list[tuple[Band, float]]:
+    """The separate simulations, and the part of the power of its source that each has."""
+    return [(band, band.weight * scene.source.power / band.scene.source.power) for band in scene.bands]
 
 
 def _entrance(scene: Scene, samples: Sampling | None) -> np.ndarray:

@@ -2,83 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 
 from caustic_cli.export import FORMATS, SOLIDS
 from caustic_cli.scene import Scene
-from caustic_cli.scene.traits import BEYOND_CLEAR, Capability
+from caustic_cli.scene.traits import Capability
 
-#: Formats that hold a single refractive index, and formats that hold all elements of a scene.
-ONE_INDEX, WHOLE = ("lighttools", "zemax", "mitsuba"), ("lighttools", *SOLIDS, "mitsuba")
-
-ONE_LENS = f"⟨format⟩ {{format}} holds a single lens; with other elements {', '.join(WHOLE)} hold the scene, without ⟨script⟩"
-SHAPE = (
-    "⟨format⟩ {format} holds one index, and this lens' varies;"
-    f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold its shape alone"
-)
-SOURCE = "⟨format⟩ {format} does not support sources of type {scene.source.kind}"
-BEAM = (
-    "⟨format⟩ {format}: its sources have rays without a wavefront, so the beam of a laser, with its waist or its phase, cannot be"
-    f" written; {', '.join(name for name in FORMATS if name not in ('lighttools', 'mitsuba'))} hold the lens alone"
-)
-SCREEN = (
-    "⟨format⟩ {format} has a screen at a distance, and this lens' picture is in the far field;"
-    f" {', '.join(name for name in FORMATS if name not in ONE_INDEX)} hold the lens alone"
-)
-MASK = (
-    "⟨format⟩ {format} holds a lens that is clear all over, not {};"
-    f" {', '.join(name for name in FORMATS if name not in (*ONE_INDEX, 'phase'))} hold its shape alone"
-)
-#: Beyond what ONE_INDEX says.
-_UNSUPPORTED: dict[str, Mapping[str, str]] = {
-    "zemax": {"other elements": ONE_LENS, "far field": SCREEN},
-    "lighttools": {"laser beam": BEAM, "user-defined source": SOURCE, "far field": SCREEN},
-    "phase": dict.fromkeys(("ray file", "ray file among sources"), "⟨format⟩ phase is that of waves, and {} have none"),
+#: Formats that hold all elements of a scene.
+WHOLE = ("lighttools", *SOLIDS, "mitsuba")
+#: By format: why it does not hold what, in the words of its table, with {} for those of the traits.
+_REASONS: dict[str, dict[str, tuple[str, ...]]] = {
+    "lighttools": {"its types of sources are those of this program": ("user-defined source",)},
+    "phase": {"rays have no phase": ("ray file", "ray file among sources")},
     "mitsuba": {
-        "laser beam": BEAM,
-        "gradient index": SHAPE,
-        "absorption": "⟨format⟩ mitsuba: its light tracer knows no media that absorb, so glass with {} cannot be written",
-        "polarisation": "⟨format⟩ mitsuba: its emitters are not polarised, so {} cannot be written",
-        **dict.fromkeys(("ray file", "ray file among sources", "user-defined source"), SOURCE),
-        **dict.fromkeys(
-            ("disc at infinity", "disc not Lambertian", "disc in a cone"),
-            "⟨format⟩ mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at infinity; render"
-            " ⟨verify⟩ mitsuba traces them all",
-        ),
+        "its rays are straight": ("gradient index",),
+        "its light tracer knows no media that absorb": ("absorption",),
+        "its emitters are not polarised": ("polarisation",),
+        "its emitters have no given rays": ("ray file", "ray file among sources", "user-defined source"),
+        "its emitters have no wavefront": ("laser beam",),
+        "its discs are Lambertian and nearby": ("disc at infinity", "disc not Lambertian", "disc in a cone"),
     },
 }
 
 
 def _exported(format: str) -> Capability:
-    index = {"gradient index": SHAPE, "round lenslets": MASK} if format in ("lighttools", "zemax") else {}
-    return Capability(f"export to {format}", index | _UNSUPPORTED.get(format, {}))
+    said = _REASONS.get(format, {})
+    others = ", ".join(name for name in FORMATS if name not in _REASONS)
+    return Capability.because(
+        f"export to {format}", said, f"⟨format⟩ {format}: {{reason}}, so {{{{}}}} cannot be written; {others} hold the lens alone"
+    )
 
 
 EXPORT: dict[str, Capability] = {format: _exported(format) for format in FORMATS}
 MOULD = Capability("moulds", {})
-SCRIPT = Capability(
+_SCRIPT = Capability.because(
     "script for LightTools",
     {
-        "laser beam": BEAM,
-        "user-defined source": SOURCE,
-        **dict.fromkeys(("other elements", "folded axis"), ONE_LENS),
-        **dict.fromkeys(BEYOND_CLEAR, "⟨script⟩ builds clear lenses and straight screens, not {}, which the archive alone holds"),
-        "gradient index": SHAPE,
-        "round lenslets": MASK,
-        "far field": SCREEN,
-        "tilted light": "⟨script⟩: its source shines along the axis, so light at an angle, which the archive alone holds, cannot be"
-        " written",
-        "lumens": "⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written",
-        "uneven plane wave": "⟨script⟩: its source is uniform, so one with a profile cannot be written",
-        **dict.fromkeys(
-            ("uneven source", "ray file", "tabulated intensity"),
-            "⟨script⟩: its source is evenly bright and uniform or Lambertian, so a picture, a table or a ray file cannot be"
-            " written",
+        "its sources have no wavefront": ("laser beam",),
+        "no call by which a sheet reflects is documented": ("mirror",),
+        "the directions of its sources are even": ("uneven directions",),
+        "it builds one solid": ("other elements", "folded axis"),
+        "no call that sets it is documented": (
+            *("gradient index", "absorption", "roughness", "polarisation"),
+            *("ray file", "ray file among sources", "tabulated intensity"),
         ),
-        "several sources": "⟨script⟩ builds one source, so that several, which the archive alone holds, cannot be written",
-        "elliptical disc": "⟨script⟩: its disc is round, so an elliptical one cannot be written",
-        "circular aperture": "⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written",
+        "its freeform solid is a rectangle": ("circular aperture", "round lenslets"),
+        "its receiver is a plane": ("curved screen", "far field"),
+        "how a plane stands about its normal is not documented": ("tilted screen", "tilted light"),
     },
+    f"⟨script⟩: {{reason}}, so {{{{}}}} cannot be written; {', '.join(WHOLE)} without ⟨script⟩ hold the scene",
+)
+
+
+#: Of what its archive holds.
+SCRIPT = replace(
+    EXPORT["lighttools"],
+    name=_SCRIPT.name,
+    unsupported={**EXPORT["lighttools"].unsupported, **_SCRIPT.unsupported},
+    reasons={**EXPORT["lighttools"].reasons, **_SCRIPT.reasons},
 )
 
 

@@ -11,7 +11,7 @@ zero derivatives OpticStudio uses finite differences, with an error of 0.05 mm a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from caustic_cli.export.text import CREATED, real, rows
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, Screen
 
 #: Least number of points along an axis in OpticStudio.
 LEAST = 5
@@ -50,7 +50,7 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
     vertex = float(field.at(heights, *torch.zeros(2, 1, dtype=torch.float64), [(0, 0)])[0])
     columns = grid.z - vertex, grid.zx, grid.zy, grid.zxy
     table = np.stack([c[:, ::-1].T.ravel() for c in columns], -1)
-    lens, (sx, sy), behind = scene.lens, scene.screen.shift, "the flat entrance"
+    lens, behind = scene.lens, "the flat entrance"
     entrance = lens.z_in
     if lens.entrance is not None:
         front, behind = entrance_of(lens), "that of the entrance, which has a file of its own"
@@ -58,20 +58,44 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
     head = [
         f"! {CREATED}",
         "! Grid Sag, mm; base radius infinity, conic 0; interpolation bicubic",
-        f"! vertex {real(vertex - entrance)} mm behind {behind}, index {real(lens.index)},"
-        f" screen {real(scene.screen.z - vertex)} mm behind the vertex",
-        *([f"! light along ({', '.join(map(real, scene.source.axis))}), a unit vector"] if scene.source.oblique else []),
-        *([f"! screen decentred by x {real(sx)} mm, y {real(sy)} mm"] if any((sx, sy)) else []),
-        *([f"! screen tilted about {_turns(scene.screen.tilt)}"] if any(scene.screen.tilt) else []),
-        *([f"! the screen is {scene.screen.shape_words()}, which this file does not contain"] if scene.screen.curved else []),
-        *(["! along the axis, which flat mirrors fold, that this file does not contain"] if scene.elements else []),
-        *([f"! circular aperture of radius {real(lens.half_size[0])} mm"] if lens.opening.round else []),
+        f"! vertex {real(vertex - entrance)} mm behind {behind}, index {real(lens.index)}, {_seen(scene.screen, vertex)}",
+        *(f"! {words}" for words in _beside(scene)),
         f"{nx} {ny} {real((grid.x[-1] - grid.x[0]) / (nx - 1))} {real((grid.y[-1] - grid.y[0]) / (ny - 1))} 0 0 0",
         "",
     ]
     with atomic_file(path) as file:
         file.write("\r\n".join(head).encode())
         file.writelines(rows(table, f"{f'%.{DIGITS}g ' * 4}0\r\n"))
+
+
+def _seen(screen: Screen, vertex: float) -> str:
+    """Where the light of a surface with this vertex, mm, is seen."""
+    if screen.far:
+        return f"picture in the far field (afocal image space): direction cosines are its lengths over {real(abs(screen.z))}"
+    return f"screen {real(screen.z - vertex)} mm behind the vertex"
+
+
+def _beside(scene: Scene) -> Iterator[str]:
+    """What belongs to the scene and is not in the file."""
+    lens, screen = scene.lens, scene.screen
+    if scene.source.oblique:
+        yield f"light along ({', '.join(map(real, scene.source.axis))}), a unit vector"
+    if any(screen.shift):
+        yield f"screen decentred by x {real(screen.shift[0])} mm, y {real(screen.shift[1])} mm"
+    if any(screen.tilt):
+        yield f"screen tilted about {_turns(screen.tilt)}"
+    if screen.curved:
+        yield f"the screen is {screen.shape_words()}, which this file does not contain"
+    if scene.elements:
+        among = "along the axis, which flat mirrors fold," if scene.unfolded is not scene else "among other elements"
+        yield f"{among} that this file does not contain"
+    if lens.opening.round:
+        yield f"circular aperture of radius {real(lens.half_size[0])} mm"
+    if lens.gradient is not None:
+        yield f"the index varies, which this file does not contain: {lens.gradient.words(lens.index)}"
+    if lens.round_lenslets:
+        radius, centres = lens.cells.radius, " ".join(f"({real(x)}, {real(y)})" for x, y in lens.cells.centres)
+        yield f"opaque but for circles of radius {real(radius)} mm (a user-defined aperture) about {centres}"
 
 
 def _turns(tilt: Sequence[float]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,10 +21,13 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import freeform_of
 from caustic_cli.scene import Component, Disc, FreeForm, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, Source
 from caustic_cli.scene.elements import COMPONENTS, SIDES
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.light import MAX_WAVELENGTHS
 from caustic_cli.scene.materials import material
 from caustic_cli.scene.screen import MAX_SAGS, Sags, tilted
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
+from caustic_cli.scene.sources.gaussian import Gaussian
+from caustic_cli.scene.sources.measured_beam import MeasuredBeam
 from caustic_cli.scene.sources.points import MAX_POINTS
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
@@ -36,10 +40,13 @@ KEYS = (
     *("cone_half_angle", "source_type", "source_positions", "source_power", "source_profile", "source_size"),
     *("source_angle", "source_tilt"),
     *("source_intensity", "source_intensity_table", "source_brightness", "source_rays_sha256"),
+    *("source_wavelength", "source_waist", "source_waist_at", "source_m2", "source_phase"),
     *("source_wavelengths", "source_weights", "source_spectrum", "source_detector", "source_efficacy"),
 )
-#: Most cells along an axis of a picture of a source.
-MOST_CELLS = 1 << 16
+#: Numbers of a Gaussian beam.
+BEAM = ("source_wavelength", "source_waist_at", "source_m2")
+#: Most cells along an axis of a picture of a source, and terms of a gradient.
+MOST_CELLS, MOST_TERMS = 1 << 16, 64
 #: Signs of x and y in the four quadrants.
 CORNERS = (-1.0, -1.0, 1.0, 1.0), (-1.0, 1.0, -1.0, 1.0)
 
@@ -54,19 +61,22 @@ def open_archive(path: str | Path, rays: RaySet | None = None) -> tuple[Scene, H
     """
     with open_npz(Path(path), ACCEPTED) as data:
         field, heights = surface_of(data)
+        array = _lenslets(data)
         lens = Lens(
             size=tuple(2.0 * h for h in field.half_size),
             z_in=data.real("z_in"),
             index=data.real("refractive_index"),
             control=field.shape,
             degree=tuple(s.degree for s in field.spaces),
-            knots=tuple(tuple(s.knots.tolist()) for s in field.spaces),
+            knots=None if array else tuple(tuple(s.knots.tolist()) for s in field.spaces),
             fresnel=data.text("fresnel", "exact"),
             aperture=data.text("aperture", "rectangle"),
             mirror="mirror" in data,
             absorption=data.real("absorption") if "absorption" in data else 0.0,
             roughness=data.real("roughness") if "roughness" in data else 0.0,
             glass=data.text("glass") if "glass" in data else None,
+            gradient=_gradient(data),
+            **array,
         )
         place = lens.opening.on_edge if lens.mirror else (0.0, 0.0)  # where light meets it first: at the edge of a mirror
         x, y = (c * torch.tensor(signs, dtype=torch.float64) for c, signs in zip(place, CORNERS, strict=True))
@@ -80,6 +90,22 @@ def open_archive(path: str | Path, rays: RaySet | None = None) -> tuple[Scene, H
         scene = Scene(_source(data, rays), lens, screen, _light(data), elements=_elements(data))
         check_exit_above_entrance(scene, field, heights)
         return scene, field, heights
+
+
+def _gradient(data: Archive) -> Gradient | None:
+    """An index that varies, or None; see `export/lighttools.py`."""
+    if "gradient" not in data:
+        return None
+    if "gradient_volume" in data:
+        return Gradient(data.text("gradient"), volume=data.reals("gradient_volume", None, None, None, most=MOST_CELLS))
+    return Gradient(data.text("gradient"), tuple(data.reals("gradient_terms", None, most=MOST_TERMS).tolist()))
+
+
+def _lenslets(data: Archive) -> dict[str, Any]:
+    """Round lenslets as arguments of a lens; empty without them."""
+    if "lenslets" not in data:
+        return {}
+    return {"array": data.wholes("lenslets", 2), "packing": data.text("lenslet_packing"), "lenslets": "round"}
 
 
 def _light(data: Archive) -> Light:
@@ -172,6 +198,7 @@ def _screen(data: Archive) -> Screen:
         _pair(data, "screen_shift"),
         _radius(data),
         sags,
+        far="screen_far" in data,
     )
 
 
@@ -192,7 +219,7 @@ def _source(data: Archive, rays: RaySet | None) -> Source:
     if kind == "rays":
         return _measured(data, rays)
     if kind not in _READERS:
-        raise InputError(f"source_type must be plane, point, grid, disc, rays or several, got {kind!r}")
+        raise InputError(f"source_type must be {', '.join(_READERS)}, rays or several, got {kind!r}")
     if rays is not None:
         raise InputError(f"⟨source.file⟩ belongs to an archive whose source is a ray file, and this one's is of type {kind}")
     return _READERS[kind](data)
@@ -246,8 +273,18 @@ def _disc(data: Archive) -> Disc:
     return Disc(_positions(data)[0], size, _power(data), brightness=brightness, **_shining(data))
 
 
+def _gaussian(data: Archive) -> Gaussian:
+    waist, (wavelength, waist_at, m2) = _pair(data, "source_waist"), map(data.real, BEAM)
+    return Gaussian(waist, wavelength, waist_at, m2, _pair(data, "source_tilt"), _power(data))
+
+
+def _measured_beam(data: Archive) -> MeasuredBeam:
+    phase = data.reals("source_phase", None, None, most=MOST_CELLS)
+    return MeasuredBeam(phase, data.real("source_wavelength"), _picture(data, "source_profile"), _power(data))
+
+
 #: Readers of a source by its kind: see `export/lighttools.py`.
-_READERS = {"plane": _plane, "point": _points, "grid": _points, "disc": _disc}
+_READERS = {"plane": _plane, "point": _points, "grid": _points, "disc": _disc, "gaussian": _gaussian, "measured": _measured_beam}
 
 
 def _power(data: Archive) -> float:

@@ -8,17 +8,17 @@ are made.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
 
 from caustic_cli.errors import InputError
 
 if TYPE_CHECKING:
     from caustic_cli.scene import Scene
 
-#: Types of sources that other programs are known to have, or files of rays.
-KNOWN_SOURCES = ("plane", "point", "grid", "disc", "rays", "several")
+#: Types of sources that this program has by itself.
+KNOWN_SOURCES = ("plane", "point", "grid", "disc", "rays", "several", "gaussian", "measured")
 
 
 def _disc(scene: Scene) -> bool:
@@ -74,7 +74,7 @@ TRAITS: Mapping[str, Trait] = {
         "the rays of a file among several sources",
         lambda s: len(s.source.members) > 1 and any(one.rays is not None for one in s.source.members),
     ),
-    "user-defined source": Trait("a type of source that other programs do not have", lambda s: s.source.kind not in KNOWN_SOURCES),
+    "user-defined source": Trait("a type of source from outside the program", lambda s: s.source.kind not in KNOWN_SOURCES),
     "laser beam": Trait("the beam of a laser", lambda s: any(one.beam for one in s.source.members)),
     "near source": Trait("a source nearby", lambda s: not s.source.distant, ("source.position",)),
     "tilted light": Trait("light that is tilted to the axis", lambda s: s.source.oblique, ("source.tilt",)),
@@ -82,6 +82,9 @@ TRAITS: Mapping[str, Trait] = {
     "separate places": Trait("sources in separate places", lambda s: s.source.apart),
     "uneven plane wave": Trait("a profile of its irradiance", lambda s: s.source.uneven, ("source.profile",)),
     "uneven source": Trait("a picture of its radiance", lambda s: s.source.brightness is not None),
+    "uneven directions": Trait(
+        "a picture of its directions", lambda s: s.source.brightness is not None and s.source.distant and not s.source.beam
+    ),
     "tabulated intensity": Trait("a table of its intensity", lambda s: not isinstance(s.source.intensity, str)),
     "uneven points": Trait("points of another than uniform intensity", lambda s: _points(s) and s.source.intensity != "uniform"),
     "disc at infinity": Trait("a disc at infinity", lambda s: _disc(s) and s.source.distant, ("source.angle",)),
@@ -101,6 +104,14 @@ class Capability:
     #: Message of its refusal for each trait that it does not support, in the order in which they are looked for; {} stands for the
     #: words of all traits of the scene with the same message, {setting} for the setting of the trait, {scene} for the scene.
     unsupported: Mapping[str, str]
+    #: Why, in a phrase, for the matrix; of traits whose message says no more than that.
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def because(cls, name: str, reasons: Mapping[str, Sequence[str]], message: str) -> Self:
+        """From the traits for each reason; message: with {reason} for it, and the rest as in `unsupported` with doubled braces."""
+        each = {trait: reason for reason, traits in reasons.items() for trait in traits}
+        return cls(name, {trait: message.format(reason=reason) for trait, reason in each.items()}, each)
 
     def obstacle(self, scene: Scene) -> str:
         """The first trait of a scene that is not supported, "" if there is none."""
@@ -126,18 +137,3 @@ class Capability:
         """
         if why := self.why_not(scene, **words):
             raise InputError(why)
-
-
-#: What other ray tracers do not represent of a single lens: those of its traits beside its surfaces and its source.
-BEYOND_CLEAR = (
-    "mirror",
-    "gradient index",
-    "absorption",
-    "roughness",
-    "polarisation",
-    "several wavelengths",
-    "tilted screen",
-    "shifted screen",
-    "curved screen",
-    "far field",
-)

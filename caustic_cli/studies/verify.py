@@ -56,13 +56,14 @@ LIGHT, LEAK = 4.0, 5e-5
 #: Tolerance for a better correlation of a flipped image, which for symmetric pictures differs by noise alone; and standard errors
 #: of a correlation, of which that of an even picture consists.
 TIE, ERRORS = 1e-2, 4.0
-VERIFICATION = Capability(
+VERIFICATION = Capability.because(
     "comparison with Mitsuba",
     {
-        "gradient index": "⟨verify⟩ mitsuba traces straight rays, which those in {} are not",
-        "polarisation": "⟨verify⟩ mitsuba traces power without polarisation, not {}",
-        "approximate Fresnel": "⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}",
+        "its rays are straight": ("gradient index",),
+        "its rays are traced without polarisation": ("polarisation",),
+        "its Fresnel reflection is exact": ("approximate Fresnel",),
     },
+    "⟨verify⟩ mitsuba: {reason}, so {{}} cannot be compared",
 )
 
 

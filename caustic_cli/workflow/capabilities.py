@@ -42,12 +42,18 @@ def capabilities() -> Iterator[Capability]:
 
 
 def matrix() -> str:
-    """What is not supported, as a table in Markdown: a row for the capabilities that support the same scenes."""
-    alike: dict[tuple[str, ...], list[str]] = {}
+    """What is not supported, as a table in Markdown: a row for the capabilities that support the same scenes for the same reasons,
+    with the reason behind the traits that have one."""
+    alike: dict[str, list[str]] = {}
     for one in capabilities():
-        if one.unsupported:
-            alike.setdefault(tuple(name for name in TRAITS if name in one.unsupported), []).append(one.name)
-    rows = [f"| {', '.join(names)} | {', '.join(TRAITS[name].words for name in traits)} |" for traits, names in alike.items()]
+        groups: dict[str, list[str]] = {}
+        for name in TRAITS:
+            if name in one.unsupported:
+                groups.setdefault(one.reasons.get(name, ""), []).append(TRAITS[name].words)
+        if groups:
+            said = "; ".join(", ".join(words) + (f" ({reason})" if reason else "") for reason, words in groups.items())
+            alike.setdefault(said, []).append(one.name)
+    rows = [f"| {', '.join(names)} | {said} |" for said, names in alike.items()]
     return "\n".join(["| capability | not for |", "| --- | --- |", *rows])
 
 
