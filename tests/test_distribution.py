@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -262,8 +263,11 @@ def test_what_goes_out_comes_back(tmp_path):
         assert again.intensity == source.intensity
         assert (again.brightness is None) == (source.brightness is None)
         assert source.brightness is None or (again.brightness == PICTURE).all()
-    with pytest.raises(InputError, match="can be written"):
-        write_mitsuba(tmp_path / "lens.xml", scene(Disc(AT, intensity=LED), lens), field, z)
+    write_mitsuba(tmp_path / "lens.xml", scene(Disc(AT, intensity=LED), lens), field, z)
+    powers = re.findall(r'name="intensity" value="([^"]+)"', (tmp_path / "lens.xml").read_text())
+    assert len(powers) > 100  # a grid of points
+    with pytest.raises(InputError, match="light from infinity has one direction"):
+        write_mitsuba(tmp_path / "sun.xml", scene(Disc(angle=4.0), lens), field, z)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ What Mitsuba makes of them is tested in test_verify.py, where it is installed.
 """
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -126,6 +127,27 @@ def test_pictures_hold_the_power_of_their_light(tmp_path):
     solid = (t[1] - t[0]) ** 2 * np.cos(angle) ** 3 * (angle <= cone)
     intensity = float((tmp_path / "a.xml").read_text().split('name="intensity" value="')[1].split('"')[0])
     assert (solid * light).sum() * intensity == pytest.approx(2.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("light", [None, UNEVEN])
+def test_a_disc_that_is_not_lambertian_is_points_of_its_extent(light, tmp_path):
+    """Its power, centroid and variances: of an ellipse a^2 / 4 and b^2 / 4, or of the cells of a picture."""
+    scene = written(tmp_path, lit_by(Disc((1.0, -2.0, -60.0), (4.0, 2.0), 3.0, intensity="uniform", brightness=light)))
+    text, cone = (tmp_path / "a.xml").read_text(), scene.source.cone_over(scene.pupil)
+    places = re.findall(r'<translate x="([^"]+)" y="([^"]+)" z="-60"/></transform>\n  <rgb', text)
+    at = np.array([[float(v) for v in place] for place in places])
+    power = np.array([float(v) for v in re.findall(r'name="intensity" value="([^"]+)"', text)])
+    power *= 4.0 * math.pi * math.sin(cone / 2.0) ** 2
+    assert power.sum() == pytest.approx(3.0)
+    cells = np.array([[1.0]]) if light is None else light
+    for k, (half, place) in enumerate(((2.0, 1.0), (1.0, -2.0))):
+        n, rows = cells.shape[k], cells.sum(1 - k) / cells.sum()
+        middles = half * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
+        mean = (rows * middles).sum()
+        wanted = half**2 / 4.0 if light is None else (rows * ((middles - mean) ** 2 + (half / n) ** 2 / 3.0)).sum()
+        found = (power * at[:, k]).sum() / 3.0
+        assert found == pytest.approx(place + mean, abs=0.02 * half)
+        assert (power * (at[:, k] - found) ** 2).sum() / 3.0 == pytest.approx(wanted, rel=0.03)
 
 
 def test_the_scenes_of_several_sources_have_their_powers(tmp_path):

@@ -136,7 +136,7 @@ def test_other_reflections_are_refused(monkeypatch):
     monkeypatch.setattr(verify, "find_spec", lambda name: True)
     scene = make()[0]
     assert not verify.unsupported(scene)
-    assert "fresnel" in verify.unsupported(replace(scene, lens=replace(scene.lens, fresnel="none")))
+    assert "Fresnel reflection is exact" in verify.unsupported(replace(scene, lens=replace(scene.lens, fresnel="none")))
 
 
 class InItsPlace:
@@ -398,6 +398,8 @@ EXPORTED = {
         lit_by(Disc((0.0, 0.0, -60.0), (9.0, 6.0), brightness=np.array([[1.0, 0.0], [0.2, 0.0]])), (160.0, 130.0)),
         0.05,
     ),
+    "uniform disc": (lit_by(Disc((0.5, 0.0, -60.0), (4.0, 3.0), intensity="uniform"), (160.0, 130.0)), -0.01),
+    "disc with a cone": (lit_by(Disc((3.0, 0.0, -60.0), (2.0, 3.0), cone=4.0), (160.0, 130.0)), 0.0),
     "line": (lit_by(Disc((0.5, 0.0, -60.0), (4.0, 0.0))), -0.01),
     "wavelengths": (dispersing, 0.05),
     **{name: (BEYOND[name], 0.005) for name in ("sphere", "far field", "leaning far field", "far field of a mirror")},

@@ -1,7 +1,8 @@
 """Emitters of a scene for Mitsuba 3, by the kind of its source.
 
 Their radiance or intensity varies over a picture where the source's does: of a wave over its aperture, of a disc over its
-rectangle, of points over the tangents of the angles to their axis.  A scene of a part of the light, a wavelength or one of several
+rectangle, of points over the tangents of the angles to their axis.  A disc that is not Lambertian over all directions is a grid of
+points.  A scene of a part of the light, a wavelength or one of several
 sources, has the power of this part.
 """
 
@@ -21,11 +22,14 @@ from caustic_cli.export.text import real
 from caustic_cli.optics.emission.base import intensity_of
 from caustic_cli.scene import Aperture, CircularAperture, Scene, Source
 from caustic_cli.scene.screen import tilted
+from caustic_cli.scene.sources.base import looked_up
 
 #: Distance of the collimated emitter before the entrance, mm.
 BEFORE = 1.0
 #: Cells of a picture that is resampled, along an axis; least width of a disc over its greater one.
 CELLS, THIN = 1024, 1e-3
+#: Points along an axis of a disc that is written as such, and finer points for the power of each.
+SIDE, FINER = 16, 8
 #: Shapes of light by the aperture that it fills.
 SHAPES = {Aperture.name: "rectangle", CircularAperture.name: "disk"}
 
@@ -42,14 +46,15 @@ def lights(path: Path, scene: Scene, part: float = 1.0) -> list[str]:
 
 def light_files(scene: Scene) -> list[str]:
     """Names of the pictures of the emitters of a scene."""
-    return ["light"] if _pictured(scene.source) else []
-
-
-def _pictured(source: Source) -> bool:
-    """Whether the light varies over a picture."""
+    source = scene.source
     if source.distant:
-        return source.uneven
-    return source.brightness is not None or (source.kind != "disc" and source.intensity != "uniform")
+        return ["light"] * source.uneven
+    return ["light"] * (source.intensity != "uniform" if _as_points(source) else source.brightness is not None)
+
+
+def _as_points(source: Source) -> bool:
+    """Whether a near source is written as points: also of discs those that are not Lambertian over all directions."""
+    return source.kind != "disc" or source.intensity != "lambertian" or source.cone is not None
 
 
 def _radiance(path: Path, mean: float, relative: np.ndarray | None) -> str:
@@ -82,6 +87,21 @@ def _collimated(path: Path, scene: Scene, part: float) -> list[str]:
     ]
 
 
+def _disc(path: Path, scene: Scene, part: float) -> list[str]:
+    """A disc that is Lambertian over all directions, or another one."""
+    return (_spots if _as_points(scene.source) else _area)(path, scene, part)
+
+
+def _pieces(source: Source) -> tuple[np.ndarray, np.ndarray]:
+    """A disc, or its picture, as points over its rectangle, (k, 2) in [-1, 1]^2, and the part of its power of each, (k,)."""
+    line = (2.0 * np.arange(SIDE * FINER) + 1.0) / (SIDE * FINER) - 1.0
+    u, v = np.meshgrid(line, line, indexing="ij")
+    light = (u * u + v * v <= 1.0).astype(float) if source.brightness is None else looked_up(source.brightness, u, v)
+    cells = light.reshape(SIDE, FINER, SIDE, FINER).sum((1, 3))
+    middles = (2.0 * np.stack(np.nonzero(cells), -1) + 1.0) / SIDE - 1.0
+    return middles, cells[cells > 0] / cells.sum()
+
+
 def _irradiance(scene: Scene, half: tuple[float, ...], axes: tuple) -> np.ndarray:
     """Irradiance relative to its mean over the aperture, at the middles of cells of a rectangle across the light with these half
     widths, (a, b)."""
@@ -110,16 +130,25 @@ def _area(path: Path, scene: Scene, part: float) -> list[str]:
     ]
 
 
+def _placed(source: Source) -> tuple[list, list]:
+    """Positions of points, mm, and their powers; a disc is a square grid of them."""
+    if source.kind != "disc":
+        return list(source.positions), list(source.powers)
+    middles, parts = _pieces(source)
+    (x, y, z), (fx, fy) = source.position, source.frame
+    return [(x + fx * u, y + fy * v, z) for u, v in middles.tolist()], (source.power * parts).tolist()
+
+
 def _spots(path: Path, scene: Scene, part: float) -> list[str]:
     """A spot emitter per point; its falloff begins beyond the cone."""
     source, cone = scene.source, scene.source.cone_over(scene.pupil)
     lines, edge = [], cone * (1.0 + 1e-4)
     mean, texture = 1.0 / (4.0 * math.pi * math.sin(cone / 2.0) ** 2), ""
-    if _pictured(source):
+    if source.intensity != "uniform":
         t = math.tan(edge) * ((2.0 * np.arange(CELLS) + 1.0) / CELLS - 1.0)
         secant = torch.from_numpy(np.sqrt(1.0 + t[:, None] ** 2 + t[None, :] ** 2))
         texture = picture(path, "light", "texture", torch.as_tensor(intensity_of(source, cone, secant)).numpy() / mean, smooth=True)
-    for (x, y, z), power in zip(source.positions, source.powers, strict=True):
+    for (x, y, z), power in zip(*_placed(source), strict=True):
         lines += [
             '<emitter type="spot">',
             f'  <transform name="to_world"><translate x="{real(x)}" y="{real(y)}" z="{real(z)}"/></transform>',
@@ -135,5 +164,5 @@ _EMITTERS: dict[str, Callable[[Path, Scene, float], list[str]]] = {
     "plane": _collimated,
     "point": _spots,
     "grid": _spots,
-    "disc": _area,
+    "disc": _disc,
 }

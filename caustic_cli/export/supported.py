@@ -20,7 +20,7 @@ _REASONS: dict[str, dict[str, tuple[str, ...]]] = {
         "its emitters are not polarised": ("polarisation",),
         "its emitters have no given rays": ("ray file", "ray file among sources", "user-defined source"),
         "its emitters have no wavefront": ("laser beam",),
-        "its discs are Lambertian and nearby": ("disc at infinity", "disc not Lambertian", "disc in a cone"),
+        "its light from infinity has one direction": ("disc at infinity",),
     },
 }
 

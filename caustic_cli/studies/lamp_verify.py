@@ -18,10 +18,10 @@ from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.studies.lamp import lamp_image
 from caustic_cli.studies.retrace import BATCHES
-from caustic_cli.studies.verify import TURN, Agreement, choose_variant, compare, follow
+from caustic_cli.studies.verify import TURN, Agreement, Surface, choose_variant, compare, follow
 
 #: Surfaces in the order of light, and rays traced at a time.
-SURFACES, CHUNK = [("inner", False), ("outer", False), ("screen", False)], 1 << 20
+SURFACES, CHUNK = [Surface(name, False, 0.0) for name in ("inner", "outer", "screen")], 1 << 20
 
 
 def verify_lamp(
@@ -43,7 +43,7 @@ def verify_lamp(
     rng = np.random.default_rng([seed, 1])
     image, squares = np.zeros((2, *pixels))
     for start in range(0, rays, CHUNK):
-        *points, weight = follow(mi, world, shapes, SURFACES, *_emitted(lamp, min(CHUNK, rays - start), rng))
+        *points, weight = follow(mi, world, shapes, SURFACES, *_emitted(lamp, min(CHUNK, rays - start), rng), rng)
         x, y = (p - middle for p, middle in zip(points, seen.shift, strict=False))
         for total, power in ((image, weight), (squares, weight**2)):
             total += np.histogram2d(x, y, pixels, [(-0.5 * s, 0.5 * s) for s in seen.size], weights=power)[0]
