@@ -211,7 +211,10 @@ def test_index_and_surface_are_designed_saved_rendered_and_exported(here, capfd)
     again = run(capfd, "render", "both", "--rays", "40000", "--quiet", "--threads", "1")
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], abs=0.03)
     assert run(capfd, "export", "both", "--format", "stl", "-o", "lens.stl")["bytes"] > 84 + 50 * 14
-    assert "varies" in run(capfd, "export", "both", "--format", "lighttools", code=2)
+    assert "varies" in run(capfd, "export", "both", "--format", "mitsuba", code=2)
+    run(capfd, "export", "both", "--format", "lighttools", "--samples", "33", "-o", "both.npz")
+    images = [load(name).render(40_000).image for name in ("both", "both.npz")]
+    np.testing.assert_allclose(*images, atol=1e-6 * float(np.max(images[0])))
 
 
 def test_six_iterations_are_three_and_three_bitwise(here, capfd):

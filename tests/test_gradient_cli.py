@@ -75,7 +75,7 @@ def test_a_gradient_index_plate_is_designed_saved_and_rendered(capfd):
     assert (
         run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] == 84 + 50 * 14
     )  # a box, of which two triangles are a side
-    assert "varies" in run(capfd, "export", "free.caustic", "--format", "lighttools", code=2)
+    assert "varies" in run(capfd, "export", "free.caustic", "--format", "mitsuba", code=2)
     (found,) = run(capfd, "gradmap", "free.caustic", "--rays", "20000", "--check", "--threads", "1", "--quiet")["maps"]
     assert found["largest"] > 0.0 and found["check"]["relative_error"] < 1e-4
     far = ("--source", "point", "--source-position", "0,0,-1e6")  # a design needs a plane wave, an image any light
