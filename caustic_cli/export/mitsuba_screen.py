@@ -26,8 +26,9 @@ DEPTH = 4
 #: Rotation that turns rectangles towards -z.
 SPIN = '<rotate x="1" angle="180"/>'
 WHITE = '<bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>'
-#: Part of a pixel by which the extent of the optics displaces light in the far field; vertices of a mesh along an axis.
-WITHIN, VERTICES = 1e-3, 257
+#: Part of a pixel by which the extent of the optics displaces light in the far field; vertices of a mesh along an axis, and at
+#: most of one of a measured shape.
+WITHIN, VERTICES, MOST = 1e-3, 257, 2049
 
 
 def far_away(scene: Scene) -> float:
@@ -107,8 +108,9 @@ def screen_of(meshes: Meshes, scene: Scene) -> list[str]:
     if receiver.shape.flat:
         return screen_shape(scene.screen, facing(scene), onto(scene))
     beyond = math.copysign(far_away(scene), receiver.forward) if scene.screen.far else 0.0
-    line = np.linspace(-1.0, 1.0, VERTICES)
-    x, y = np.meshgrid(*(h * line for h in scene.screen.half_size), indexing="ij")
+    sags, half = scene.screen.sags, scene.screen.half_size
+    counts = (VERTICES,) * 2 if sags is None else (min(MOST, max(VERTICES, n)) for n in sags.values.shape)
+    x, y = np.meshgrid(*(np.linspace(-h, h, n) for h, n in zip(half, counts, strict=True)), indexing="ij")
     points = receiver.shape.points(x, y, receiver.middle, receiver.axes, beyond)
     along, across = (np.gradient(points, axis=k) for k in (0, 1))
     normals = -receiver.forward * np.cross(along, across)
