@@ -353,7 +353,7 @@ def test_a_source_from_outside(ring, kernels, tmp_path):
     steepest = math.atan((1.5 + math.hypot(5.0, 4.0)) / 20.0)  # never more
     assert 0.9 * steepest < bounds_of(scene, field, heights).incidence <= steepest
     for write, name in ((write_mitsuba, "lens.xml"), (write_lighttools, "lens.npz")):
-        with pytest.raises(InputError, match="does not support sources of type ring"):
+        with pytest.raises(InputError, match="a type of source from outside the program cannot be written"):
             write(tmp_path / name, scene, field, heights)
     assert not list(tmp_path.iterdir())
 
