@@ -105,7 +105,6 @@ SCENES: dict[str, Scene] = {
     "curved screen": screen(sags=Sags(np.zeros((4, 4)), PLAIN.screen.size)),
     "far field": screen(far=True),
     "several sources": of(Several((PlaneWave(), PlaneWave(2.0)), (NONE, NONE))),
-    "sources at once": of(Several((PlaneWave(), PlaneWave(2.0)), (NONE, NONE))),
     "ray file": of(FILE),
     "ray file among sources": of(Several((PlaneWave(), FILE), (NONE, NONE))),
     "user-defined source": of(Ring((AT,), kind="ring")),

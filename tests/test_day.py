@@ -15,10 +15,11 @@ from caustic_cli import cli, load
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.room import Room
 from caustic_cli.scene.room_screen import placed
 from caustic_cli.scene.screen import tilted
+from caustic_cli.scene.sources.several import Several
 from caustic_cli.scene.sunlight import Sunlight, moment
 from caustic_cli.studies import day as study
 from caustic_cli.studies.day import Day, Follower, Instant, follow_day, hours_of_sun, moved, smoothed
@@ -99,11 +100,13 @@ def test_light_through_a_pane_without_a_picture_goes_straight(place, source):
         assert (room.to_room(tuple(place_on))[0] < 0) == (minutes < 0)  # it comes from the other side
 
 
-def test_error_and_light_are_those_of_renders(project, follower):
-    """On the screen where it stands, and on one at the place to which the picture was followed."""
-    time = NOON + timedelta(minutes=3)
-    found, designed = follower.at(time).instant, load(project)
-    lens = load(project, room_time=time.isoformat(), source="plane")
+@pytest.mark.parametrize("shape", [{}, {"screen_radius": [600.0, 600.0]}, {"screen_radius": [-400.0, float("inf")]}])
+def test_error_and_light_are_those_of_renders(project, shape):
+    """On the screen where it stands, and on one at the place to which the picture was followed; plane or curved."""
+    time, designed = NOON + timedelta(minutes=3), load(project, **shape)
+    follower = Follower(designed.plan().scene, designed.field, designed.heights, designed.target, LIGHT, rays=20_000)
+    found = follower.at(time).instant
+    lens = load(project, room_time=time.isoformat(), source="plane", **shape)
     there = moved(lens.scene.screen, *(a + b for a, b in zip(found.moved, follower.offset, strict=True)))
     image, still = lens.render(rays=200_000)
     on_it, followed = replace(lens, scene=lens.scene.onto(there)).render(rays=200_000)
@@ -113,6 +116,28 @@ def test_error_and_light_are_those_of_renders(project, follower):
     gain = [math.cos(math.radians(LIGHT.room.incidence([-c for c in LIGHT.sun(t).direction]))) for t in (time, NOON)]
     power = gain[0] * followed["on_target"] / (gain[1] * designed.render(rays=200_000).figures["on_target"])
     assert found.brightness == pytest.approx(power, rel=0.01)
+
+
+def test_lamps_stand_still_beside_the_sun():
+    """Light of the sun and of a lamp before the pane: their sum is that of each by itself, with the sun's cosine; a source alone at
+    infinity takes no notice of what the lamp is."""
+    lens, screen = Lens((10.0, 10.0), control=(8, 8), offset=Offset(5.0)), Screen((60.0, 60.0), 200.0, (20, 20))
+    heights, field = torch.full((8, 8), 5.0, dtype=torch.float64), HeightField.of(lens)
+    noon, later = (replace(PlaneWave(3.0), tilt=LIGHT.tilt(NOON + timedelta(minutes=m))) for m in (0, 8))
+    lamp = Points(((5.0, 0.0, -150.0),), (2.0,))
+    both = Scene(Several((noon, lamp), (((), ()), ((), ()))), lens, screen)
+    target = expose(both, field, heights, rays_of(both, "sobol", 1 << 14)).image.numpy()
+    follower = Follower(both, field, heights, target, LIGHT, rays=200_000)
+    seen = follower.at(NOON + timedelta(minutes=8))
+    watts = np.zeros(seen.around.shape)
+    around = screen.grown((20, 20))
+    for source, cosine in ((later, later.axis[2] / noon.axis[2]), (lamp, 1.0)):
+        one = Scene(source, lens, around)
+        image = expose(one, field, heights, rays_of(one, "sobol", 1 << 16)).image.numpy()
+        watts += source.power * cosine * image
+    coarse = [a.reshape(6, 10, 6, 10).sum((1, 3)) for a in (5.0 * seen.around, watts)]
+    assert coarse[0] == pytest.approx(coarse[1], abs=0.01 * coarse[1].max()) and watts.sum() > 2.5
+    assert follower.white.sum() == pytest.approx(target.sum(), rel=0.02)
 
 
 def test_periods():
@@ -172,7 +197,6 @@ def test_render(project, monkeypatch, capfd, tmp_path):
     [
         (("--day", "tomorrow"), "a date like 2026-06-21"),
         (("--day", "1066-10-14"), "1900 to 2099"),
-        (("--day", DATE, "--screen-radius", "400"), "curved screen"),
         (("--day", DATE, "--cut", "a.gcode"), "--cut goes without --day"),
         (("--day", DATE, "--faces", "0"), "from behind"),
         (("--day", DATE, "--sun", "70,20,2026-06-21T12:00+02:00", "--source", "plane", "--slope", "60"), "no time that day"),

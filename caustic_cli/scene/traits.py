@@ -66,9 +66,6 @@ TRAITS: Mapping[str, Trait] = {
     "curved screen": Trait("a curved screen", lambda s: s.screen.curved, ("screen.radius", "screen.shape_file")),
     "far field": Trait("a picture in the far field", lambda s: s.screen.far, ("screen.far",)),
     "several sources": Trait("several sources", lambda s: len(s.source.members) > 1, ("source.also", "source.each")),
-    "sources at once": Trait(
-        "several sources at once", lambda s: len(s.source.members) > 1 and not s.source.in_turn, ("source.also", "source.each")
-    ),
     "ray file": Trait("the rays of a file", lambda s: s.source.rays is not None, ("source.type rays",)),
     "ray file among sources": Trait(
         "the rays of a file among several sources",

@@ -1,8 +1,9 @@
 """The picture of a lens in a window through a day: where the sun carries it, and how long it is legible.
 
-Lens and screen stand still, and the sun moves.  At each time the light is traced to the plane of the screen, and the image looked
-at twice: on the screen where it stands, and on a screen of the same size that is moved in that plane after the picture, to the
-median of its light and then to the best match with the target (`studies.tolerances.best_shift`).
+Lens and screen stand still, and the sun moves: all sources at infinity have its direction, and those nearby stand still, too.  At
+each time the light is traced to the plane of the screen, and the image looked at twice: on the screen where it stands, and on a
+screen of the same size and shape that is moved in that plane after the picture, to the median of its light and then to the best
+match with the target (`studies.tolerances.best_shift`).  That of a curved screen is its tangent plane.
 
 Notation
     F           relative RMS error against the target, of two independent halves of the rays, corrected for their noise
@@ -16,8 +17,8 @@ Notation
 Of a sundial the picture is at each time that of the nearest of its hours, with F_0, P_0 and C of its own; it is on the screen as
 far as its target is, displaced as it is.
 
-Powers are those of a beam of constant irradiance across it, of which the pane receives the cosine of its incidence: air, which
-weakens a low sun, is not in them.  Stray light is left out: ghosts, and what meets a surface twice.
+Powers of the sun are those of a beam of constant irradiance across it, of which the pane receives the cosine of its incidence: air,
+which weakens a low sun, is not in them.  Stray light is left out: ghosts, and what meets a surface twice.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from datetime import date, datetime, timedelta, tzinfo
 from functools import cached_property, partial
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -44,21 +45,14 @@ from caustic_cli.optics.misalignment import Misalignment, landing_points
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene import Scene, Screen, Source
+from caustic_cli.scene.screen import tilted
 from caustic_cli.scene.sunlight import Hours, Sunlight, hours, in_words
-from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.metrics import figures_of_merit
 from caustic_cli.studies.noise import variance_of
 from caustic_cli.studies.retrace import limited_to_source, mean_of, sampler_for
 from caustic_cli.studies.tolerances import best_shift
 
-DAY = Capability(
-    "a day of sunlight",
-    {
-        "curved screen": "⟨day⟩ moves a plane screen after its picture, and this scene has {}",
-        "sources at once": "⟨day⟩ follows one sun, and this scene has {}; ⟨+room.place⟩ with a single time gives it one",
-    },
-)
 #: Rays of a time, both halves included, and by how many times fewer match the picture to the target.
 RAYS, MATCHING = 200_000, 8
 #: Rays that find the median of the light, and points along each axis of the coarse surface that they pass.
@@ -115,8 +109,8 @@ class Instant:
 
 @dataclass(frozen=True)
 class Looked:
-    """An instant with its images, (n_x, n_y) or (3, n_x, n_y), power per pixel over that of the beam at normal incidence: on the
-    followed screen, and around the screen where it stands."""
+    """An instant with its images, (n_x, n_y) or (3, n_x, n_y), power per pixel over that of the light of the design: on the screen
+    that follows, and around the one that stands still."""
 
     instant: Instant
     image: np.ndarray
@@ -154,9 +148,10 @@ class Follower:
         self.scene, self.field, self.heights, self.target, self.light = scene, field, heights, target, light
         self.rays, self.seed, self.device = rays, seed, device
         self._coarse = _coarse(field, heights)
-        self._start = _median(self._landing(scene))
-        self._image, self.offset, self.error, _ = self._followed(scene, (0.0, 0.0))
-        self._power = self._on_picture(self._image) * scene.source.axis[2]
+        self._start = _median(self._landing(scene, scene.screen.uncurved))
+        #: Image of the design, on the scale of `Looked`.
+        self.white, self.offset, self.error, _ = self._followed(scene, (0.0, 0.0))
+        self._power = self._on_picture(self.white)
 
     def of(self, time: datetime) -> Follower:
         """The follower of the picture that is looked for at a time."""
@@ -168,20 +163,16 @@ class Follower:
         grey, as_designed = self.target.sum(0) if self.target.ndim == 3 else self.target, FACTOR * self.error + MORE
         return as_designed, max(as_designed, CONTRAST * float(grey.std() / grey.mean()))
 
-    @property
-    def white(self) -> np.ndarray:
-        """The image of the design, on the scale of `Looked`."""
-        return self._image * self.scene.source.axis[2]
-
     def at(self, time: datetime) -> Looked:
         """The picture at a time at which the sun shines through the pane.
 
         Raises:
             InputError: the light grazes the plane of the screen, or meets it where that reaches the lens.
         """
-        sun, scene = self.light.sun(time), replace(self.scene, source=replace(self.scene.source, tilt=self.light.tilt(time)))
-        cosine, landing = scene.source.axis[2], self._landing(scene)
-        place = _median(landing)
+        sun, tilt = self.light.sun(time), self.light.tilt(time)
+        scene = replace(self.scene, source=self.scene.source.each(partial(_under, tilt)))
+        more, cosine = scene.source.power / self.scene.source.power, tilted(tilt)[2][2]
+        place, landing = _median(self._landing(scene, scene.screen.uncurved)), self._landing(scene, scene.screen)
         image, at, followed, whole = self._followed(scene, (place[0] - self._start[0], place[1] - self._start[1]))
         around, still = self._where_it_stands(scene, landing)
         lands = 0.0 if still is None else float(mean_of(still).image.sum())
@@ -194,10 +185,10 @@ class Follower:
             followed,
             (at[0] - self.offset[0], at[1] - self.offset[1]),
             self.bounds,
-            self._on_picture(image) * cosine / self._power if self._power else 0.0,
+            self._on_picture(image) * more / self._power if self._power else 0.0,
             lands / whole if whole else 0.0,
         )
-        return Looked(instant, image * cosine, around * cosine)
+        return Looked(instant, image * more, around * more)
 
     def kept(self, moved: tuple[float, float]) -> float:
         """Part of the target that is on the screen where it stands after a displacement along the screen's axes, mm."""
@@ -250,10 +241,18 @@ class Follower:
             sampler = sampler_for(one.batch(k, 2), max(1, rays), stream(self.seed, f"day {k}"), self.device)
             yield limited_to_source(expose(one, self.field, heights, sampler))
 
-    def _landing(self, scene: Scene) -> Landing:
-        """Landing points of rays through the coarse surface."""
+    def _landing(self, scene: Scene, screen: Screen) -> Landing:
+        """Landing points on a screen of rays through the coarse surface."""
+        scene = scene.onto(screen)
         rays = rays_of(scene, "stratified" if scene.source.parallel else "sobol", FINDING, stream(self.seed, "day"))
         return [(p.x, p.y, p.power) for p in landing_points(scene, *self._coarse, rays, Misalignment())]
+
+
+def _under(tilt: tuple[float, float], source: Source) -> Source:
+    """A source with the light of the sun in another direction, if it is at infinity."""
+    if not source.distant:
+        return source
+    return replace(cast(Any, source), tilt=tilt, power=source.power * tilted(tilt)[2][2] / source.axis[2])
 
 
 class SundialFollower:

@@ -34,7 +34,7 @@ class DayOfSunlight(Output):
     """The film and the plot, beside the image; day: an ISO date, in the time zone of the design."""
 
     option: ClassVar[str] = "day"
-    capability: ClassVar[Capability] = study.DAY
+    capability: ClassVar[Capability] = Capability("a day of sunlight", {})
     files: ClassVar[tuple[str, ...]] = ("day.gif", "day.png")
     beyond: ClassVar[bool] = True
 
