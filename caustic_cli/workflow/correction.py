@@ -65,15 +65,16 @@ def correct(
         InputError: a photograph is not one of this lens' caustic, or `out` exists.
         CausticError: a photograph is explained badly, the gain is within its uncertainty, or no surface is within the limits.
     """
-    taken = photographs.shots(photos, marks, corners)
     project = Project.open(path)
     lens = Lens.of(project)
+    taken = photographs.shots(photos, marks, corners, lens.scene.colored)
     if why := photographs.refuse_lens(lens):
         raise InputError(why)
     directory.check(out, force)
     judged = photographs.judge(lens, taken, say)
     refuse_bad_fit(judged)
-    heights = corrected_heights(project, lens, judged, device)
+    every = corrected_heights(project, lens, judged, device)
+    heights = exit_of(every)
     figures = predicted(lens, judged, heights)
     with naming(photos[0]):
         refuse_uncertain(figures)
@@ -83,13 +84,13 @@ def correct(
     made = scaled(known, found.guess.scale) + deviation(lens.field, found.guess.modes)
     figures["round"] = 1 if before is None else len(before.history) + 1
     history = (*(() if before is None else before.history), figures | {"photo": judged.figures})
-    state = replace(lens.state, heights=heights, start=None, unrounded=None, optimizer={}, parameters={}, reason="corrected")
+    state = replace(lens.state, heights=every, start=None, unrounded=None, optimizer={}, parameters={}, reason="corrected")
     target = replace(project, path=out)
     inputs = {"asked": "", "settings": uptodate.digest(target.settings, target.picture)}
     directory.create(target, force, Checkpoint(state, lens.field.spaces, provenance(target, device), {}, inputs))
     designed = lens.heights if before is None else before.designed
     correction.write(out, correction.Correction(made - lens.heights, designed, history))
-    comparison.write_plot(out / PLOT, judged.shown[0], np.asarray(lens.target), found, lens.encoding)
+    comparison.write_plot(out / PLOT, judged.shown[0], judged.targets[0], found, lens.encoding)
     target.hold.close()
     return {"project": str(out), "correction": figures | {"plot": str(out / PLOT)}, "photo": judged.figures}
 
@@ -110,7 +111,8 @@ def refuse_bad_fit(judged: Judged) -> None:
 
 
 def corrected_heights(project: Project, lens: Lens, judged: Judged, device: str) -> Tensor:
-    """H', within the limits of the design, (n, m) mm.
+    """H', within the limits of the design, (n, m) mm; of a design of several surfaces those of all, (k, n, m), of which only the
+    exit is corrected.
 
     Raises:
         CausticError: there are none.
@@ -123,8 +125,15 @@ def corrected_heights(project: Project, lens: Lens, judged: Judged, device: str)
     if before is not None:
         wanted = wanted - (before.deviation - before.deviation.mean())
     assert lens.state is not None
-    feasible = problem_of(project, device).feasible(lens.state.stage, wanted.to(lens.heights.dtype))
-    return rounded(feasible.detach().cpu())
+    wanted, designed = wanted.to(lens.heights.dtype), lens.state.heights
+    every = wanted if designed.ndim == 2 else torch.cat([designed[:-1], wanted[None]])
+    feasible = rounded(problem_of(project, device).feasible(lens.state.stage, every).detach().cpu())
+    return feasible if designed.ndim == 2 else torch.cat([designed[:-1], feasible[-1:]])
+
+
+def exit_of(heights: Tensor) -> Tensor:
+    """Heights (n, m) of the exit, of its own or of those of several surfaces (k, n, m)."""
+    return heights if heights.ndim == 2 else heights[-1]
 
 
 def predicted(lens: Lens, judged: Judged, heights: Tensor) -> dict[str, Any]:
@@ -162,18 +171,27 @@ def errors_of(lens: Lens, part: Tensor) -> tuple[float, float]:
     """Errors of the picture of a part of these heights, registered and in the frame of the screen, by the mean of two images with
     rays of their own, without the noise that their difference shows: that of few rays is no error of a part."""
     target = np.asarray(lens.target)
-    rays, aim = min(max(LEAST, EACH * target.size), MOST), target / target.mean()
+    rays = min(max(LEAST, EACH * target.size), MOST)
+    lit = list(photographs.channels_of(lens.scene)) if lens.scene.colored else ...
     images = [
         retrace(lens.scene, lens.field, part, target, rays=rays, seed=lens.seed + k, noise=False)[0].image.cpu().numpy()
         for k in range(2)
     ]
-    a, b = (image / image.mean() for image in images)
+    aim, a, b = (_over_means(image[lit]) for image in (target, *images))
     image, noise = 0.5 * (a + b), 0.25 * float(np.square(a - b).mean())
+    onto = np.array([comparison.registered(*one) for one in zip(image, aim, strict=True)])
 
     def without_noise(seen: np.ndarray) -> float:
-        return math.sqrt(max(0.0, relative_rms(seen, aim) ** 2 - noise))
+        each = (stack.reshape(-1, stack.shape[-1]) for stack in (seen, aim))
+        return math.sqrt(max(0.0, relative_rms(*each) ** 2 - noise))
 
-    return without_noise(comparison.registered(image, aim)), without_noise(image)
+    return without_noise(onto), without_noise(image)
+
+
+def _over_means(image: np.ndarray) -> np.ndarray:
+    """Images (k, n, m) of an image (n, m), or of one of k colours, each over its mean."""
+    each = image.reshape(-1, *image.shape[-2:])
+    return each / each.mean((1, 2), keepdims=True)
 
 
 def refuse_uncertain(figures: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ A photograph in another light or on another screen than the project's is named b
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,13 @@ from torch import Tensor
 from caustic_cli.config import settings
 from caustic_cli.config.settings import read_text
 from caustic_cli.errors import InputError
+from caustic_cli.io.colorimetry import XYZ_OF_RGB
 from caustic_cli.io.files import naming
+from caustic_cli.optics.screen_shape import areas
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.project import correction
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, Screen
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.photograph import comparison, inference, registration
 from caustic_cli.studies.photograph.camera import DISPLACEMENTS
@@ -43,24 +45,18 @@ TAKEN = ("source", "screen")
 #: Correlation from which on two unknowns count as one.
 ALIKE = 0.9
 
-_MESSAGE = "⟨photo⟩ judges a single lens of uniform index and one surface to be made, and this one has {}"
-_PLACES = "⟨photo⟩ tells where light left the part by where it lands, which {} leave open: photograph it in the light of one"
-PHOTOGRAPHS = Capability(
-    "photographs of a part",
-    dict.fromkeys(
-        ("gradient index", "other elements", "lenslet array", "coloured picture", "curved screen", "far field"),
-        _MESSAGE,
-    )
-    | {"two sides": "⟨photo⟩ tells the form of one surface, and errors of either side of this lens do the same to its picture"}
-    | dict.fromkeys(("several sources", "separate places"), _PLACES)
-    | {"ray file": "⟨photo⟩ follows rays of their own through each point of the part, and {} are given"},
-)
+PHOTOGRAPHS = Capability("photographs of a part", {})
+#: Channels of a photograph in colour.
+CHANNELS = ("red", "green", "blue")
+#: Part of the light from which on that of a colour is judged.
+WORTH = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A photograph as it is given: its file and codes, marks (a file) or corners of the screen (4, 2), and the light and the screen
-    by path in `schema.table` -> value, where they are not the project's; throw: for that of the screen, mm."""
+    """A photograph as it is given: its file and codes (rows, columns), in colour (3, rows, columns), marks (a file) or corners of
+    the screen (4, 2), and the light and the screen by path in `schema.table` -> value, where they are not the project's; throw: for
+    that of the screen, mm."""
 
     path: Path
     codes: np.ndarray
@@ -79,7 +75,8 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """Photographs of a part, with what they show and what was inferred from them."""
+    """Photographs of a part, with what they show and what was inferred from them.  One in colour counts as one in the light of each
+    colour."""
 
     photographs: tuple[registration.Photograph, ...]
     found: inference.Inference
@@ -89,8 +86,11 @@ class Judged:
     before: correction.Correction | None
     #: Correlation of each photograph and the image of the lens, blurred.
     like: tuple[float, ...]
-    #: The scene of each photograph.
+    #: The scene of each photograph, and the colour of its light, None for all of it.
     scenes: tuple[Scene, ...]
+    channels: tuple[int | None, ...]
+    #: Irradiance of the picture, (n, m), of each.
+    targets: tuple[np.ndarray, ...]
 
     @property
     def marked(self) -> bool:
@@ -113,19 +113,32 @@ class Judged:
             "explained": f.explained,
             "residual_codes": f.fits[0].residual,
             "correlated_px": f.fits[0].correlated,
-            "not_told_apart": not_told_apart(f, self.marked),
+            "not_told_apart": not_told_apart(f, self.marked, self.scenes[0].two_sided or bool(self.scenes[0].unfolded.elements)),
             "rounds_before": 0 if self.before is None else len(self.before.history),
         }
-        first, *others = (self._of(k) for k in range(len(self.photographs)))
+        first, *others = map(self._of, range(len(self.photographs)))
         return first | {"part": part} | ({"others": others} if others else {})
+
+    @property
+    def of_first(self) -> np.ndarray:
+        """The first photograph on the screen, irradiance over its mean, (n, m), or (3, n, m) in the parts of the light of each
+        colour."""
+        first, parts = self.shown[0].irradiance, self.scenes[0].light.fractions
+        if not self.scenes[0].colored:
+            return first
+        found = np.zeros((len(CHANNELS), *first.shape))
+        for one, channel in zip(self.shown, channels_of(self.scenes[0]), strict=False):
+            found[channel] = parts[channel or 0] * one.irradiance
+        return found
 
     def _of(self, number: int) -> dict[str, Any]:
         """Figures of one photograph."""
         p, s, view = self.photographs[number], self.shown[number], self.found.guess.views[number]
+        channel = self.channels[number]
         camera, response, rx = p.camera, view.response, self.scenes[number].screen.half_size[0]
         kept = self.found.of_view(number)
         return {
-            "file": str(p.path),
+            "file": f"{p.path}" + ("" if channel is None else f" ({CHANNELS[channel]})"),
             "registered_by": camera.found,
             "marks": camera.marks,
             "mark_sigma_px": camera.sigma if camera.marks else None,
@@ -151,15 +164,17 @@ class Judged:
         }
 
 
-def not_told_apart(found: inference.Inference, marked: bool) -> list[str]:
+def not_told_apart(found: inference.Inference, marked: bool, others: bool = False) -> list[str]:
     """What photographs do not tell apart, always or by the uncertainty of this fit, in sentences; marked: whether
-    marks say where the screen is."""
+    marks say where the screen is; others: whether other surfaces bend the light, too."""
     several, shared = found.throws_free, inference.OWN * len(found.fits)
     words = [
         "piston: a surface that is higher all over gives the same picture",
         "tilt of the surface and tilt of the part where it was mounted: both shift the picture",
         f"scale of the relief{' and' if several else ', throw and'} index less one: the picture depends on their product",
     ]
+    if others:
+        words.append("errors of the exit and of other surfaces: all are taken for the exit's, which can correct them")
     sigma = np.sqrt(np.diag(found.covariance))
     alike = np.abs(found.covariance / np.maximum(np.outer(sigma, sigma), 1e-300))
     count = len(found.guess.modes)
@@ -213,8 +228,11 @@ def corners_of(texts: tuple[str, ...] | None) -> np.ndarray | None:
     return np.array(found)
 
 
-def shots(photos: Sequence[Path], marks: str | None = None, corners: tuple[str, ...] | None = None) -> tuple[Shot, ...]:
-    """Photographs by their files, or by TOML files that name them; marks and corners: of a single one that names none.
+def shots(
+    photos: Sequence[Path], marks: str | None = None, corners: tuple[str, ...] | None = None, color: bool = False
+) -> tuple[Shot, ...]:
+    """Photographs by their files, or by TOML files that name them; marks and corners: of a single one that names none; color: with
+    their colours.
 
     Raises:
         InputError: a file cannot be read, or marks and corners do not belong to one photograph.
@@ -225,9 +243,9 @@ def shots(photos: Sequence[Path], marks: str | None = None, corners: tuple[str, 
     found = []
     for path in photos:
         if path.suffix.lower() == ".toml":
-            found.append(_named_by(path))
+            found.append(_named_by(path, color))
         else:
-            found.append(Shot(path, registration.read_codes(path), file, places))
+            found.append(Shot(path, registration.read_codes(path, color), file, places))
     if len(found) > 1 and not (file is None and places is None):
         which = "marks" if places is None else "screen_corners"
         raise InputError(f"⟨{which}⟩ are of one photograph, and there are {len(found)}; name each in a TOML file with its own")
@@ -245,7 +263,7 @@ def files_of(path: Path) -> list[Path]:
     return [path, *(path.parent / str(named[key]) for key in ("photo", "marks") if key in named)]
 
 
-def _named_by(path: Path) -> Shot:
+def _named_by(path: Path, color: bool) -> Shot:
     """The photograph that a TOML file names, see the module."""
     given = settings.toml_of(read_text(path), f"{path}")
     own = {key: given.pop(key, None) for key in ("photo", "marks", "screen_corners", "throw")}
@@ -265,18 +283,30 @@ def _named_by(path: Path) -> Shot:
         raise InputError(f"{path}: [{others[0]}] is not of a photograph, whose sections are {', '.join(f'[{s}]' for s in TAKEN)}")
     flat = {f"{section}.{key}": value for section, table in scene.items() for key, value in table.items()}
     photo, marks = (None if own[key] is None else path.parent / own[key] for key in ("photo", "marks"))
-    return Shot(photo, registration.read_codes(photo), marks, corners_of(corners), flat, throw)
+    return Shot(photo, registration.read_codes(photo, color), marks, corners_of(corners), flat, throw)
 
 
 def waves_of(lens: Lens, heights: Tensor) -> np.ndarray | None:
-    """The wave image of a lens that was refined on it, with other heights, over the mean of all light, (n, m); None of others."""
+    """The wave image of a lens that was refined on it, with other heights, power per pixel, (n, m) or (3, n, m); None of others."""
     if not lens.by_waves:
         return None
     try:
-        found = wave_image(lens.scene, lens.field, heights.detach()).image.cpu().double().numpy()
+        return wave_image(lens.scene, lens.field, heights.detach()).image.cpu().double().numpy()
     except NoWaveImage:
         return None
-    return found * found.size
+
+
+def channels_of(scene: Scene) -> tuple[int | None, ...]:
+    """The colours in whose light a scene is photographed one by one, None for all light at once."""
+    if not scene.colored:
+        return (None,)
+    return tuple(k for k, part in enumerate(scene.light.fractions) if part > WORTH)
+
+
+def irradiance_of(image: np.ndarray, screen: Screen, channel: int | None) -> np.ndarray:
+    """Irradiance of power per pixel, (n, m), or of a channel of (3, n, m), on pixels of unit area."""
+    light, true = image if channel is None else image[channel], areas(screen)
+    return light if true is None else light / true
 
 
 def judge(lens: Lens, taken: Sequence[Shot], say: Reporter) -> Judged:
@@ -285,24 +315,39 @@ def judge(lens: Lens, taken: Sequence[Shot], say: Reporter) -> Judged:
     Raises:
         InputError: one is not of the caustic of this lens, or in a light in which none can be judged.
     """
-    heights, before = known_heights(lens)
-    photographs, observations, lenses, expected = [], [], [], []
+    (heights, before), seen = known_heights(lens), []
     for shot in taken:
         own = shot.lens(lens)
         with naming(shot.path):
             if why := refuse_lens(own):
                 raise InputError(why)
-        assert own.target is not None
-        wave = waves_of(own, heights)
-        model = PartModel(own.scene, own.field, heights, RAYS**2, wave)
-        image, screen = model.image(own.target.shape) if wave is None else wave, own.scene.screen
-        places = {"marks": shot.marks, "corners": shot.corners}
-        seen = registration.register(shot.path, shot.codes, image, screen.half_size, screen.shift, **places)
-        observations.append(inference.Observation(model, seen.for_model, seen.camera.covariance))
-        photographs.append(seen), lenses.append(own), expected.append(image)
+        seen += _seen(shot, own, heights)
+    photographs, observations, scenes, targets, expected, channels = zip(*seen, strict=True)
     with say.progress(None) as show:
         found = inference.infer(observations, show=lambda done, whole: show("photograph", "inferring the part", done, whole))
-    views = zip(photographs, found.guess.views, lenses, expected, strict=True)
-    shown = tuple(comparison.compare(seen, view, own.target, image) for seen, view, own, image in views)
-    like = tuple(registration.refuse_unlike(seen, image) for seen, image in zip(photographs, expected, strict=True))
-    return Judged(tuple(photographs), found, shown, before, like, tuple(own.scene for own in lenses))
+    views = zip(photographs, found.guess.views, targets, expected, strict=True)
+    shown = tuple(comparison.compare(one, view, target, image) for one, view, target, image in views)
+    like = tuple(registration.refuse_unlike(one, image) for one, image in zip(photographs, expected, strict=True))
+    return Judged(photographs, found, shown, before, like, scenes, channels, targets)
+
+
+#: A photograph, what is inferred from it, its scene, target (n, m) and expected image (n, m), and the colour of its light.
+_Seen = tuple[registration.Photograph, inference.Observation, Scene, np.ndarray, np.ndarray, int | None]
+
+
+def _seen(shot: Shot, lens: Lens, heights: Tensor) -> Iterator[_Seen]:
+    """A photograph of a lens of these heights in the light of each colour; lens: in its light and before its screen."""
+    assert lens.target is not None
+    scene, wave, places = lens.scene, waves_of(lens, heights), {"marks": shot.marks, "corners": shot.corners}
+    codes = shot.codes
+    if scene.colored:
+        codes = registration.by_light(codes, np.linalg.solve(XYZ_OF_RGB, scene.light.primaries))
+    for channel in channels_of(scene):
+        part = 1.0 if channel is None else scene.light.fractions[channel]
+        light = None if wave is None else irradiance_of(wave, scene.screen, channel) * (math.prod(scene.screen.resolution) / part)
+        target = irradiance_of(lens.target, scene.screen, channel)
+        model = PartModel(scene, lens.field, heights, RAYS**2, light, channel)
+        image = model.image(target.shape) if light is None else light
+        mine, (half, shift) = codes if channel is None else codes[channel], (scene.screen.half_size, scene.screen.shift)
+        found = registration.register(shot.path, mine, image, half, shift, shape=model.shape, **places)
+        yield found, inference.Observation(model, found.for_model, found.camera.covariance), scene, target, image, channel

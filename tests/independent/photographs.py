@@ -108,6 +108,40 @@ def landed_from(lens, heights, error, point=None, angle=0.0, rays=600, seed=0):
     return px + far * d[0] - sx, py + far * d[1] - sy, np.where(inside, power, 0.0)
 
 
+def leaving(lens, heights, error, origin, direction, index):
+    """Rays in the glass, origins and unit directions (3, N), met by the exit surface with an error by Newton's method and refracted
+    into air: points and unit directions, (3, N).  index: where they leave, a number or a function of the points."""
+    rx, ry = lens.field.half_size
+    fine = [np.linspace(-r, r, 900) for r in (rx, ry)]
+    z = surface_at(lens.field, heights, *fine)[0]
+    if error is not None:
+        z = z + RectBivariateSpline(*(np.linspace(-r, r, k) for r, k in zip((rx, ry), error.shape, strict=True)), error)(*fine)
+    surface = RectBivariateSpline(*fine, z)
+    t = (float(z.mean()) - origin[2]) / direction[2]
+    for _ in range(6):
+        px, py, _ = origin + t * direction
+        zx, zy = surface.ev(px, py, dx=1), surface.ev(px, py, dy=1)
+        t -= (origin[2] + t * direction[2] - surface.ev(px, py)) / (direction[2] - zx * direction[0] - zy * direction[1])
+    point = origin + t * direction
+    zx, zy = (surface.ev(*point[:2], **order) for order in ({"dx": 1}, {"dy": 1}))
+    normal = np.stack([-zx, -zy, np.ones_like(zx)]) / np.sqrt(1 + zx**2 + zy**2)
+    n = index(point) if callable(index) else index
+    return point, refracted(direction, normal, n)
+
+
+def refracted(direction, normal, ratio):
+    """Unit directions (3, N) behind an interface with unit normals along the light, and the ratio of the indices before and behind
+    it (Snell's law in vector form)."""
+    cosine = (direction * normal).sum(0)
+    return ratio * direction + (np.sqrt(1.0 - ratio**2 * (1.0 - cosine**2)) - ratio * cosine) * normal
+
+
+def lattice(lens, rays):
+    """Points of a square lattice of rays x rays over the aperture, (2, N) mm."""
+    x, y = ((2.0 * (np.arange(rays) + 0.5) / rays - 1.0) * r for r in lens.field.half_size)
+    return np.stack([c.ravel() for c in np.meshgrid(x, y, indexing="ij")])
+
+
 def waves(lens, heights, error, wavelengths=(0.00047, 0.00055, 0.00063), samples=3072, coarse=500, throw=None):
     """Light of a plane wave behind a part on the screen as waves: half widths (mm) of a square grid and irradiance on it, over its
     mean on the screen; wavelengths: mm.
@@ -181,6 +215,9 @@ def photographed(
     marks=None,
     wave=None,
     light=None,
+    sag=None,
+    lift=(0.0, 0.0, 0.0),
+    colours=None,
     **how,
 ):
     """An 8-bit photograph (rows, columns): of the screen through a projective camera with distortion; bytes of its JPEG, and the
@@ -188,28 +225,35 @@ def photographed(
 
     view: (8,) projective map from (X, Y) to pixels before distortion; exposure: of the brightest 0.2 % of pixels, 1 saturates;
     marks: (N, 2) centres of dark discs and their radius; wave: light on the screen as of `waves`, instead of rays;
-    light: rays as of `landed_from`.
+    light: rays as of `landed_from`; sag: height of a curved screen at (X, Y), half widths, and lift (3,) what it adds to the view;
+    colours: (3, 3) linear R, G, B of the light of each of three colours, whose rays are then three of them.
     """
     w, h = size
     view = np.array([0.36 * w, 0.02 * w, 0.5 * w, 0.015 * h, -0.40 * h, 0.49 * h, 0.03, -0.02]) if view is None else view
     (cx, cy), half = ((w - 1) / 2, (h - 1) / 2), 0.5 * np.hypot(w, h)
 
     def project(X, Y):
-        q = view[6] * X + view[7] * Y + 1.0
-        a, b = (view[0] * X + view[1] * Y + view[2]) / q, (view[3] * X + view[4] * Y + view[5]) / q
+        S = 0.0 if sag is None else sag(X, Y)
+        q = view[6] * X + view[7] * Y + lift[2] * S + 1.0
+        a = (view[0] * X + view[1] * Y + lift[0] * S + view[2]) / q
+        b = (view[3] * X + view[4] * Y + lift[1] * S + view[5]) / q
         a, b = (a - cx) / half, (b - cy) / half
         s = 1.0 + distortion * (a * a + b * b)
         return cx + half * s * a, cy + half * s * b
 
     rx, ry = lens.scene.screen.half_size
-    if wave is None:
+    if colours is not None:
+        each = [_counted(project, size, *rays, rx, ry) for rays in light]
+        light = np.clip(np.tensordot(colours, each, 1), 0.0, None)
+    elif wave is None:
         x, y, *power = light or landed(lens, heights, error, rays=rays, **how)
         light = _counted(project, size, x, y, power[0] if power else np.ones_like(x), rx, ry)
     else:
         X, Y = _inverse(project, size)
         light = RectBivariateSpline(wave[0], wave[0], wave[1], kx=1, ky=1).ev(X * rx, Y * ry)
         light = light.reshape(h, FINER, w, FINER).mean((1, 3))
-    radiance = exposure / np.percentile(gaussian_filter(light, blur), 99.8) * light + background
+    width = (*[0.0] * (light.ndim - 2), blur, blur)
+    radiance = exposure / np.percentile(gaussian_filter(light, width), 99.8) * light + background
     if marks is not None:
         centres, radius = marks
         X, Y = _inverse(project, size)
@@ -219,11 +263,12 @@ def photographed(
         dark = dark.reshape(h, FINER, w, FINER).mean((1, 3))
         radiance = radiance * (1.0 - 0.95 * dark)
     rng = np.random.default_rng(seed)
-    light = gaussian_filter(radiance, blur)
+    light = gaussian_filter(radiance, width)
     codes = np.clip(light, 0, 1) ** (1 / gamma) + noise * rng.standard_normal(light.shape)
     pixels = np.rint(255 * np.clip(codes, 0, 1)).astype(np.uint8)
     data = io.BytesIO()
-    Image.fromarray(pixels).save(data, "JPEG", quality=quality)
+    upright = np.ascontiguousarray(np.moveaxis(pixels, 0, -1)) if pixels.ndim == 3 else pixels
+    Image.fromarray(upright).save(data, "JPEG", quality=quality)
     return data.getvalue(), project
 
 

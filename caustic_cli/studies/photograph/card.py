@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import CREATED_BY, SOFTWARE, atomic_file, write_bytes
-from caustic_cli.studies.photograph.camera import Camera, fit_camera
+from caustic_cli.studies.photograph.camera import Camera, Shape, fit_camera
 
 #: Positions of the marks along an edge, in half widths of their rectangle; this rectangle over the screen; radius of a mark over
 #: the mean half width of the screen.
@@ -41,8 +41,8 @@ def marks_of_card() -> np.ndarray:
     return AROUND * np.array([*corners, *inner, (BESIDE, 1.0)])
 
 
-def find_marks(photograph: np.ndarray) -> Camera:
-    """The camera by the marks of the card in a photograph (rows, columns) of linear light, at most 1.
+def find_marks(photograph: np.ndarray, shape: Shape | None = None) -> Camera:
+    """The camera by the marks of the card in a photograph (rows, columns) of linear light, at most 1; shape: of a curved screen.
 
     Raises:
         InputError: they are not found.
@@ -57,18 +57,20 @@ def find_marks(photograph: np.ndarray) -> Camera:
                 camera = fit_camera(known[:4], places[[corners[i] for i in turn]], size, "marks")
                 matched = _matched(camera, known, places, radii)
                 if len(matched) >= least and matched[-1][0] == len(known) - 1:
-                    return _refitted(matched, known, places, radii, size)
+                    return _refitted(matched, known, places, radii, size, shape)
     raise InputError("shows no marks of the test card")
 
 
-def _refitted(matched: list, known: np.ndarray, places: np.ndarray, radii: np.ndarray, size: tuple[int, int]) -> Camera:
+def _refitted(
+    matched: list, known: np.ndarray, places: np.ndarray, radii: np.ndarray, size: tuple[int, int], shape: Shape | None
+) -> Camera:
     """The camera through all marks that were matched, matched once more by it."""
     camera = None
     for _ in range(2):
         if len(matched) < 4:
             break
         i, j = np.array(matched).T
-        camera = fit_camera(known[i], places[j], size, "marks")
+        camera = fit_camera(known[i], places[j], size, "marks", shape)
         matched = _matched(camera, known, places, radii)
     assert camera is not None  # four corners are matched by the camera through them
     return camera

@@ -266,8 +266,9 @@ def asked(prior: Sobolev, count: int, more: int) -> bool:
 def throws_before(models: Sequence[PartModel]) -> np.ndarray:
     """Covariance (N, N) of t, mm^2: of the place of the part, the same for all, and of each measurement; 0 but for rounding for
     photographs at one distance, which tell it from the scale of the relief no more than a single one does."""
-    z = np.array([model.scene.screen.z for model in models])
-    free = float(np.ptp(z) > APART * np.abs(z).max())
+    screens = [model.scene.screen for model in models]
+    z = np.array([screen.z for screen in screens])
+    free = float(np.ptp(z) > APART * np.abs(z).max() and not any(screen.far for screen in screens))
     return free * ((PLACE * z.mean()) ** 2 + MEASURED**2 * np.eye(len(z))) + 1e-12 * np.eye(len(z))
 
 

@@ -7,24 +7,25 @@ Notation
     s           scale of the relief, which is s times as high as it should be about its mean height
     c           amplitudes (9,) of the displacements of `camera.displacements`, half widths of the screen
     t           by how much the screen of a photograph is farther away than it is said to be, mm
-    E           irradiance over its mean on the screen, on the pixels of a grid
+    E           irradiance over its mean on the screen, on the pixels of a grid; on a curved screen per area of itself
     L           light on the sensor, gain E + background, of which 1 saturates it
     code        min(L, 1)^(1 / gamma), in [0, 1]
 
 Rays lie on a regular lattice and are traced by the tracer of the project.  To first order a ray's landing point depends on the
 surface through height and slope where it leaves: three traces, of a surface raised and tilted a little, give the derivatives with
 respect to every mode.  The image, on the finest pixels of more rays than its derivatives, is a sum of quadratic B-splines (3 x 3
-pixels) of the landing points, blurred by a Gaussian, and that of an extended source its convolution with the image of that source
-by the middle of the lens.
+pixels) of the landing points, blurred by a Gaussian, and that of an extended source its convolution with the mean image of that
+source through the lens (`optics.spread`); several sources have images of their own, which add up.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,21 +35,22 @@ from scipy.sparse import csc_matrix
 from torch import Tensor
 
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.source_image import source_images
-from caustic_cli.optics.spread import POINT
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.screen_shape import shape_of
+from caustic_cli.optics.spread import POINT, Spread, spread_at
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
-from caustic_cli.optics.trace import tracers
+from caustic_cli.optics.trace import Tracer, tracers
 from caustic_cli.scene import Scene
-from caustic_cli.studies.photograph.camera import displacements
+from caustic_cli.studies.photograph.camera import Shape, displacements
 
 #: Height and slope of the surfaces by which derivatives are found: displacements of rays of a thousandth of a pixel, well above
 #: rounding.
 RAISED, TILTED = 1e-4, 1e-6
 #: Displacement of the screen for the same, mm.
 FARTHER = 0.1
-#: Rays of a prediction over those of its derivatives.
-MORE = 4
+#: Rays of a prediction over those of its derivatives; most points of a source that have as many rays each.
+MORE, MOST = 4, 8
 #: Width by which the rectangle of the modes is larger than the aperture at each of its edges, over the aperture: the slopes of
 #: cosines vanish at the edges of their rectangle, those of a part at its own do not.
 BEYOND = 0.15
@@ -164,11 +166,40 @@ def scaled(heights: Tensor, scale: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Landing:
-    """Rays on the screen: (X, Y) in half widths and power, (N,) each; those that do not arrive have none."""
+    """Rays on the screen: (X, Y) in half widths and power, (N,) each; those that do not arrive have none.  ends: of each light's
+    rays, which follow each other."""
 
     x: np.ndarray
     y: np.ndarray
     power: np.ndarray
+    ends: tuple[int, ...]
+
+    @property
+    def parts(self) -> list[slice]:
+        """The rays of each light."""
+        return [slice(a, b) for a, b in zip((0, *self.ends), self.ends, strict=False)]
+
+
+@dataclass(frozen=True, eq=False)
+class _SharpLight:
+    """The light of one source without its extent, whose image blurs that of this light everywhere; fraction: of all light."""
+
+    scene: Scene
+    fraction: float
+    spread: Spread
+
+    @classmethod
+    def of(cls, scene: Scene, fraction: float, field: HeightField, heights: Tensor) -> _SharpLight:
+        """That of a source; with its extent where it has no image of its own, as separate points and the rays of a file."""
+        spread = None if scene.source.apart else spread_at(scene, field, heights)
+        return cls(scene if spread is None else replace(scene, source=scene.source.pointlike()), fraction, spread or POINT)
+
+    def traced(self, field: HeightField, rays: int, channel: int | None) -> list[Tracer]:
+        """Tracers of about so many rays, of several points of each; of a colour channel alone, if one is given."""
+        source = self.scene.source
+        points = 1 if source.distant or source.rays is not None else min(MOST, len(source.points()[0]))
+        found = tracers(self.scene, field, rays_of(self.scene, "grid", points * rays), torch.float64, 1 << 24)
+        return [one for one in found if channel in (None, one.channel)]
 
 
 class PartModel:
@@ -176,22 +207,37 @@ class PartModel:
 
     Args:
         scene, field, heights: the lens as it was designed, with the error known of it so far.
-        rays: about how many.
+        rays: about how many of each source.
         wave: E of these heights as waves, (n, m) over the screen; diffraction is then the difference from rays that it makes of
             this surface, of the deviation's it is not known.
+        channel: of the colours of the light, the one that is photographed.
     """
 
-    def __init__(self, scene: Scene, field: HeightField, heights: Tensor, rays: int, wave: np.ndarray | None = None):
-        self.wave = wave
-        #: The image of an extended source by the middle of the part, which blurs that of its centre everywhere.
-        self.spread = next(iter(source_images(scene, middle=True)), POINT)
-        scene = replace(scene, source=scene.source.pointlike())
-        self.scene, self.field, self.heights = scene, field, heights.detach().double().cpu()
+    def __init__(
+        self,
+        scene: Scene,
+        field: HeightField,
+        heights: Tensor,
+        rays: int,
+        wave: np.ndarray | None = None,
+        channel: int | None = None,
+    ):
+        self.wave, self.scene, self.field, self.heights = wave, scene, field, heights.detach().double().cpu()
+        self.lights = [
+            _SharpLight.of(one, fraction, field, self.heights)
+            for one, fraction in zip(scene.by_source, scene.source.fractions, strict=True)
+        ]
         self._beyond = np.zeros((2, 1))
         self._bases: list[tuple[np.ndarray, np.ndarray]] | None = None
-        self._tracers, self._more = (
-            list(tracers(scene, field, rays_of(scene, "grid", count), torch.float64, 1 << 24)) for count in (rays, MORE * rays)
-        )
+        self._tracers, self._more = ([one.traced(field, n, channel) for one in self.lights] for n in (rays, MORE * rays))
+        parts = (1.0 if channel is None else one.scene.light.fractions[channel] for one in self.lights)
+        #: Of the light, that of the channel.
+        self._share = math.fsum(light.fraction * part for light, part in zip(self.lights, parts, strict=True))
+
+    @property
+    def spreads(self) -> list[Spread]:
+        """The image of the source of each light."""
+        return [one.spread for one in self.lights]
 
     def made(self, guess: Guess) -> Tensor:
         """Control heights of the part."""
@@ -202,7 +248,7 @@ class PartModel:
         base = self.designed
         moved = self._moved(guess) + self._beyond
         moved = moved + throw * self.by_throw if throw else moved
-        return Landing(base.x + moved[0], base.y + moved[1], base.power)
+        return replace(base, x=base.x + moved[0], y=base.y + moved[1])
 
     def trace(self, guess: Guess) -> None:
         """Trace the part itself, so that derivatives need only reach from here."""
@@ -231,30 +277,33 @@ class PartModel:
             ]
         return self._bases
 
-    def land(self, heights: Tensor, throw: float = 0.0, through: list | None = None) -> Landing:
-        """The rays of a surface on the screen, which is `throw` farther away, mm; through: other tracers than its own."""
-        screen, found = self.scene.screen, []
-        screen = replace(screen, z=screen.z + throw * math.copysign(1.0, screen.z)) if throw else screen
-        with torch.no_grad():
-            for traced in self._tracers if through is None else through:
-                ray = traced.land({EXIT: heights}, screen)[0]
-                shape = torch.broadcast_shapes(*(torch.as_tensor(c).shape for c in (*ray.origin[:2], ray.power)))
-                found.append([torch.as_tensor(c).expand(shape).reshape(-1) for c in (*ray.origin[:2], ray.power)])
-                found[-1][2] = found[-1][2] * traced.weight
-        x, y, power = (torch.cat(c).numpy() for c in zip(*found, strict=True))
+    def land(self, heights: Tensor, throw: float = 0.0, through: list[list[Tracer]] | None = None) -> Landing:
+        """The rays of a surface on the screen, which is `throw` farther away, mm, unless it is the far field; through: other
+        tracers than its own."""
+        screen, found, ends = self.scene.screen, [np.zeros((3, 0))], []
+        if throw and not screen.far:
+            screen = replace(screen, z=screen.z + throw * math.copysign(1.0, screen.z))
+        for light, own in zip(self.lights, self._tracers if through is None else through, strict=True):
+            for traced in own:
+                with torch.no_grad():
+                    x, y, power = _flat(traced.land({EXIT: heights}, screen)[0])
+                found.append(np.stack([x, y, light.fraction / self._share * traced.weight * power]))
+            ends.append(sum(one.shape[1] for one in found))
+        x, y, power = np.concatenate(found, 1)
         (rx, ry), (sx, sy) = screen.half_size, screen.shift
-        return Landing((x - sx) / rx, (y - sy) / ry, np.where(np.isfinite(x + y), power, 0.0))
+        x, y, arrives = (x - sx) / rx, (y - sy) / ry, np.isfinite(x + y)
+        if screen.curved:
+            _, zx, zy = shape_of(screen).at(np.where(arrives, x, 0.0) * rx, np.where(arrives, y, 0.0) * ry)
+            power = power / np.sqrt(1.0 + zx * zx + zy * zy)
+        return Landing(x, y, np.where(arrives, power, 0.0), tuple(ends))
 
     @cached_property
     def places(self) -> tuple[np.ndarray, np.ndarray]:
         """Where the rays leave the designed surface, (u, v) in [0, 1], (N,) each."""
-        found, (rx, ry) = [], self.field.half_size
+        (rx, ry), parameters = self.field.half_size, {EXIT: self.heights}
         with torch.no_grad():
-            for traced in self._tracers:
-                state = traced.last({EXIT: self.heights}).state
-                shape = torch.broadcast_shapes(*(torch.as_tensor(c).shape for c in (*state.origin[:2], state.power)))
-                found.append([torch.as_tensor(c).expand(shape).reshape(-1) for c in state.origin[:2]])
-        x, y = (torch.cat(c).numpy() for c in zip(*found, strict=True))
+            found = [_flat(traced.ends(parameters)[0].state) for own in self._tracers for traced in own]
+        x, y, _ = np.concatenate(found, 1)
         return 0.5 * (x / rx + 1.0), 0.5 * (y / ry + 1.0)
 
     @cached_property
@@ -264,12 +313,23 @@ class PartModel:
 
     def image(self, shape: tuple[int, int]) -> np.ndarray:
         """E of the designed surface by rays on n x m pixels of the screen, over the mean of all light."""
-        at, edges = self.designed, [np.linspace(-1.0, 1.0, n + 1) for n in shape]
-        light = np.histogram2d(at.x, at.y, edges, weights=at.power)[0]
-        if max(self.spread.reach()) > 0:
-            rx, ry = self.scene.screen.half_size
-            light = fftconvolve(light, self.spread.kernel((2 * rx / shape[0], 2 * ry / shape[1])), mode="same")
-        return light * light.size
+        at, edges, (rx, ry) = self.designed, [np.linspace(-1.0, 1.0, n + 1) for n in shape], self.scene.screen.half_size
+        whole = np.zeros(shape)
+        for part, spread in zip(at.parts, self.spreads, strict=True):
+            light = np.histogram2d(at.x[part], at.y[part], edges, weights=at.power[part])[0]
+            if max(spread.reach()) > 0:
+                light = fftconvolve(light, spread.kernel((2 * rx / shape[0], 2 * ry / shape[1])), mode="same")
+            whole += light
+        return whole * whole.size
+
+    @property
+    def shape(self) -> Shape | None:
+        """S of a curved screen at points (X, Y), half widths along X."""
+        screen = self.scene.screen
+        if not screen.curved:
+            return None
+        (rx, ry), shape = screen.half_size, shape_of(screen)
+        return lambda x, y: shape.at(rx * x, ry * y)[0] / rx
 
     @cached_property
     def diffraction(self) -> np.ndarray | None:
@@ -303,6 +363,12 @@ class PartModel:
         return np.nan_to_num(np.array([more.x - less.x, more.y - less.y]) / (2 * step))
 
 
+def _flat(state: RayState) -> np.ndarray:
+    """x, y and power of rays, (3, N)."""
+    values = [torch.as_tensor(c) for c in (*state.origin[:2], state.power)]
+    return torch.stack([c.double().reshape(-1) for c in torch.broadcast_tensors(*values)]).numpy()
+
+
 def _gaussian(image: np.ndarray, blur: float) -> np.ndarray:
     """Images (..., n, m) blurred by this many pixels."""
     return gaussian_filter(image, (0.0,) * (image.ndim - 2) + (blur, blur), truncate=CUT, mode="nearest") if blur > 0 else image
@@ -325,23 +391,27 @@ class Grid:
         #: Pixels along a half width of the screen, and on the whole screen.
         self.finer = [n / (high - low) for n, (low, high) in zip(shape, window, strict=True)]
         self.pixels = 4.0 * self.finer[0] * self.finer[1]
-        self.kernel: np.ndarray | None = None
-        if model is not None and max(model.spread.reach()) > 0:
+        #: Of the light of each source.
+        self.kernels: list[np.ndarray | None] = [None]
+        if model is not None:
             half = model.scene.screen.half_size
-            pixel = [(high - low) * r / n for (low, high), r, n in zip(window, half, shape, strict=True)]
-            self.kernel = model.spread.kernel((pixel[0], pixel[1]))
-        self.around = AROUND + (0 if self.kernel is None else max(self.kernel.shape) // 2)
+            wide, high = ((b - a) * r / n for (a, b), r, n in zip(window, half, shape, strict=True))
+            self.kernels = [one.kernel((wide, high)) if max(one.reach()) > 0 else None for one in model.spreads]
+        self.around = AROUND + max(0 if kernel is None else max(kernel.shape) // 2 for kernel in self.kernels)
         self.wide = (shape[0] + 2 * self.around, shape[1] + 2 * self.around)
 
     def inner(self, image: np.ndarray) -> np.ndarray:
         """An image without what lies around the grid."""
         return image[..., self.around : -self.around, self.around : -self.around]
 
-    def blurred(self, image: np.ndarray, response: Response) -> np.ndarray:
-        """Sharp images (..., n, m) as the source and the camera blur them."""
-        if self.kernel is not None:
-            image = fftconvolve(image, self.kernel[(None,) * (image.ndim - 2)], mode="same", axes=(-2, -1))
-        return _gaussian(image, self.sensor_blur(response))
+    def blurred(self, images: Sequence[np.ndarray], response: Response) -> np.ndarray:
+        """Sharp images (..., n, m) of all lights as their sources and the camera blur them, summed up."""
+        whole: Any = 0.0
+        for image, kernel in zip(images, self.kernels, strict=True):
+            if kernel is not None:
+                image = fftconvolve(image, kernel[(None,) * (image.ndim - 2)], mode="same", axes=(-2, -1))
+            whole = whole + image
+        return _gaussian(whole, self.sensor_blur(response))
 
     def compared(self, image: np.ndarray) -> np.ndarray:
         """Images (..., n, m) of the grid as they are compared: smoothed, without what is not known."""
@@ -385,15 +455,18 @@ class Grid:
         return weights, slopes, (index[0][:, None] * self.wide[1] + index[1][None]).reshape(9, -1)
 
     def counted(self, landing: Landing, camera: np.ndarray) -> np.ndarray:
-        """E on the wide grid."""
+        """E on the wide grid by each light, (lights, a, b)."""
         (x, y), _, pixels = self._weights(landing, camera)
-        light = np.zeros(self.wide[0] * self.wide[1])
+        light = np.zeros((len(landing.ends), self.wide[0] * self.wide[1]))
         for k, (i, j) in enumerate(product(range(3), range(3))):
-            light += np.bincount(pixels[k], x[i] * y[j] * landing.power, len(light))
-        return self.pixels * light.reshape(self.wide)
+            power = x[i] * y[j] * landing.power
+            for image, part in zip(light, landing.parts, strict=True):
+                image += np.bincount(pixels[k, part], power[part], len(image))
+        return self.pixels * light.reshape(-1, *self.wide)
 
     def splats(self, landing: Landing, camera: np.ndarray) -> tuple[csc_matrix, csc_matrix]:
-        """Matrices (pixels of the wide grid, N), float32, from power times displacement along X and Y to the change of E."""
+        """Matrices (pixels of the wide grid, N), float32, from power times displacement along X and Y to the change of E of its
+        light."""
         weights, slopes, pixels = self._weights(landing, camera)
         rows, pointers = pixels.T.ravel(), np.arange(0, 9 * len(landing.x) + 1, 9, dtype=np.int32)
 
@@ -414,7 +487,7 @@ class Prediction:
     guess: Guess
     view: View
     landing: Landing
-    #: E on the wide grid, sharp and blurred.
+    #: E on the wide grid: sharp, by each light, and blurred.
     sharp: np.ndarray
     blurred: np.ndarray
 
@@ -424,7 +497,8 @@ class Prediction:
         derivatives."""
         view = guess.views[number]
         landing = model.landing(guess, view.throw)
-        sharp = grid.counted(landing if light is None else light, view.camera) + grid.sampled(model.diffraction, view.camera)
+        sharp = grid.counted(landing if light is None else light, view.camera)
+        sharp[0] += grid.sampled(model.diffraction, view.camera)
         return cls(model, grid, guess, view, landing, sharp, grid.blurred(sharp, view.response))
 
     @property
@@ -442,21 +516,27 @@ class Prediction:
         stack = [by_light * gain * self.blurred, by_light, by_gamma, by_light * gain * (wider - self.blurred) / step]
         return grid.compared(grid.inner(np.array(stack))).astype(np.float32)
 
-    def _of_images(self, images: np.ndarray) -> np.ndarray:
-        """Derivatives of the codes (N, n, m) from those of the sharp E, (pixels, N)."""
-        r, grid = self.view.response, self.grid
-        images = grid.blurred(np.ascontiguousarray(images.T).reshape(-1, *grid.wide), r)
+    def _displaced(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Derivatives of the codes (k, n, m) by displacements of the rays along X and Y times their power, (N, k) each."""
+        r, grid, (by_x, by_y) = self.view.response, self.grid, self.splats
+        each = [by_x[:, part] @ x[part] + by_y[:, part] @ y[part] for part in self.landing.parts]
+        images = grid.blurred([np.ascontiguousarray(image.T).reshape(-1, *grid.wide) for image in each], r)
         images *= (r.slopes(self.blurred)[0] * np.exp(r.log_gain)).astype(images.dtype)
         return grid.compared(grid.inner(images))
 
+    @cached_property
+    def splats(self) -> tuple[csc_matrix, csc_matrix]:
+        """As of the grid."""
+        return self.grid.splats(self.landing, self.view.camera)
+
     def by_shape(self) -> Iterator[np.ndarray]:
         """Derivatives of the codes by c, (9, n, m); by t and s, (2, n, m); by the modes (k, .), (l, n, m) for each k."""
-        power, (by_x, by_y) = self.landing.power, self.grid.splats(self.landing, self.view.camera)
+        power = self.landing.power
         fields = (displacements(self.landing.x, self.landing.y) * power).astype(np.float32)  # (9, 2, N)
-        yield self._of_images(by_x @ fields[:, 0].T + by_y @ fields[:, 1].T)
+        yield self._displaced(fields[:, 0].T, fields[:, 1].T)
         model, guess = self.model, self.guess
         dx, dy = (np.array([model.by_throw, model.by_scale]).swapaxes(0, 1) * power).astype(np.float32)  # (2, N) each
-        yield self._of_images(by_x @ dx.T + by_y @ dy.T)
+        yield self._displaced(dx.T, dy.T)
         (up, along_x, along_y), ((cu, su), (cv, sv)) = model.responses, model.bases(len(guess.modes))
         parts = [(power * c).astype(np.float32) for c in (*up, *along_x, *along_y)]  # up x, up y, slope x: x, y, slope y: x, y
         for k in range(len(guess.modes)):
@@ -464,4 +544,4 @@ class Prediction:
             of_value = [a * parts[0] + b * parts[2], a * parts[1] + b * parts[3]]
             of_slope = [a * parts[4], a * parts[5]]
             x, y = (of_value[i][:, None] * cv + of_slope[i][:, None] * sv for i in (0, 1))
-            yield self._of_images(by_x @ x + by_y @ y)
+            yield self._displaced(x, y)

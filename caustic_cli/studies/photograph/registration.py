@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter, zoom
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import naming, read_bytes
 from caustic_cli.io.picture import read_picture
-from caustic_cli.studies.photograph.camera import Camera, fit_camera, rectified
+from caustic_cli.studies.photograph.camera import Camera, Shape, fit_camera, rectified
 from caustic_cli.studies.photograph.card import find_marks
 from caustic_cli.studies.photograph.model import WHOLE, Window
 
@@ -50,6 +50,16 @@ SEEN = {
 }
 
 
+def by_light(codes: np.ndarray, primaries: np.ndarray) -> np.ndarray:
+    """Codes (3, rows, columns) of a photograph in sRGB, about as of the light of each colour alone.
+
+    primaries: linear R, G, B of sRGB of a unit of each light, as the columns of a matrix.
+    """
+    apart = np.linalg.inv(primaries / np.diag(primaries)[None, :])
+    light = np.clip(np.tensordot(apart, codes**ABOUT, 1), 0.0, 1.0) ** (1.0 / ABOUT)
+    return np.where(codes >= SATURATED, codes, light)
+
+
 @dataclass(frozen=True, eq=False)
 class Photograph:
     """A photograph and its camera."""
@@ -76,17 +86,20 @@ class Photograph:
         return np.where((full > PARTLY) & (full < 1.0 - PARTLY), np.nan, seen)
 
 
-def read_codes(path: Path) -> np.ndarray:
-    """The codes of a photograph, (rows, columns) in [0, 1].
+def read_codes(path: Path, color: bool = False) -> np.ndarray:
+    """The codes of a photograph, (rows, columns) in [0, 1], or of its red, green and blue, (3, rows, columns).
 
     Raises:
-        InputError: it cannot be read, is too small, black or without contrast.
+        InputError: it cannot be read, is too small, black, without contrast or without colours.
     """
-    picture = read_picture(path)
+    picture = read_picture(path, color=color)
     if picture.values.dtype == np.float64:
         raise InputError(f"{path}: holds numbers, not the codes of a camera; a PNG, JPEG or TIFF of 8 or 16 bits is needed")
-    codes = picture.values / np.iinfo(picture.values.dtype).max
+    found = picture.values / np.iinfo(picture.values.dtype).max
+    codes = found.max(-1) if color else found
     with naming(path):
+        if color and (codes == found.min(-1)).all():
+            raise InputError("has no colours, and the picture of this lens has: a photograph in colour is needed")
         if min(codes.shape) < LEAST:
             raise InputError(
                 f"is {codes.shape[1]} x {codes.shape[0]} pixels; a photograph of at least {LEAST} along each side is needed"
@@ -98,7 +111,7 @@ def read_codes(path: Path) -> np.ndarray:
             raise InputError("is blown out: more than 90 % of it are at the camera's maximum; a shorter exposure is needed")
         if bright - middle < CONTRAST and codes.std() < 0.5 * CONTRAST:
             raise InputError("has no contrast: nothing on it is brighter than the rest; a photograph of the caustic is needed")
-    return codes
+    return np.moveaxis(found, -1, 0) if color else found
 
 
 def read_marks(path: Path, half_size: tuple[float, float], shift: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -135,12 +148,14 @@ def register(
     *,
     marks: Path | None = None,
     corners: np.ndarray | None = None,
+    shape: Shape | None = None,
 ) -> Photograph:
     """The photograph with its camera, by marks of a file, the corners of the screen (4, 2), marks of the test card in it, or the
     picture itself.
 
     Args:
         expected: E of the lens as designed, (n, m).
+        shape: of a curved screen; without marks it counts as seen along its normal, from far away.
 
     Raises:
         InputError: neither is possible, or it does not show the caustic of this lens upright.
@@ -149,12 +164,12 @@ def register(
     if marks is not None:
         places = read_marks(marks, half_size, shift)
         with naming(marks):
-            camera = fit_camera(*places, size, f"marks of {marks}")
+            camera = fit_camera(*places, size, f"marks of {marks}", shape)
     elif corners is not None:
-        camera = fit_camera(np.array(CORNERS), corners, size, "corners of the screen")
+        camera = fit_camera(np.array(CORNERS), corners, size, "corners of the screen", shape)
     else:
         try:
-            camera = find_marks(codes**ABOUT)
+            camera = find_marks(codes**ABOUT, shape)
             camera = replace(camera, found="marks of the test card")
         except InputError:
             camera = by_picture(codes, expected)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from caustic_cli.io.picture import WIDE, write_image, write_npy
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.photograph import comparison
+from caustic_cli.studies.viewing import as_viewed
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
 from caustic_cli.workflow.photographs import PHOTOGRAPHS, Shot, files_of, judge, refuse_lens, shots
@@ -41,20 +42,20 @@ class PartPhotograph(Output):
         return refuse_lens(lens)
 
     def prepare(self, rendering: Rendering) -> None:
-        self.taken = shots(self.photo, self.marks, self.screen_corners)
+        self.taken = shots(self.photo, self.marks, self.screen_corners, rendering.scene.colored)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """photo: as of `workflow.photographs.Judged.figures`, with the paths of the files."""
         lens, paths = rendering.lens, self.paths(rendering.place)
         assert lens.target is not None
         found = judge(lens, self.taken, rendering.say)
-        shown, white = found.shown[0], float(lens.target.max() / lens.target.mean())
+        shown, aim = found.shown[0], found.targets[0]
         made, deviation = comparison.surfaces(found.found)
         image, values, missing, plot, part, off = paths
-        write_image(image, shown.irradiance, white, lens.encoding, WIDE)
-        write_npy(values, shown.irradiance)
-        write_image(missing, shown.missing, white, lens.encoding, WIDE)
-        comparison.write_plot(plot, shown, lens.target, found.found, lens.encoding)
+        write_image(image, *as_viewed(found.scenes[0], found.of_first, lens.target), lens.encoding, WIDE)
+        write_npy(values, found.of_first)
+        write_image(missing, shown.missing, float(aim.max() / aim.mean()), lens.encoding, WIDE)
+        comparison.write_plot(plot, shown, aim, found.found, lens.encoding)
         write_npy(part, made)
         write_npy(off, deviation)
         names = ("image", "values", "missing_image", "plot", "part_file", "deviation_file")
