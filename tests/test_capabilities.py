@@ -102,7 +102,8 @@ SCENES: dict[str, Scene] = {
     "lumens": light(unit="lm"),
     "tilted screen": screen(tilt=(10.0, 0.0)),
     "shifted screen": screen(shift=(3.0, 0.0)),
-    "curved screen": screen(sags=Sags(np.zeros((4, 4)), PLAIN.screen.size)),
+    "curved screen": screen(radius=(50.0, math.inf)),
+    "unrollable screen": screen(sags=Sags(np.zeros((4, 4)), PLAIN.screen.size)),
     "far field": screen(far=True),
     "several sources": of(Several((PlaneWave(), PlaneWave(2.0)), (NONE, NONE))),
     "ray file": of(FILE),
@@ -164,7 +165,7 @@ def reported(scene, path):
 def shopped(scene, path):
     CAPABILITIES["page for the shop"].refuse(scene)
     report = manufacture(scene, *surface(scene))
-    write_page(path.with_suffix(".html"), "part", scene, *surface(scene), report, "", (50.0, 40.0), 0, True)
+    write_page(path.with_suffix(".html"), "part", scene, *surface(scene), report, "", (50.0, 40.0), 0)
 
 
 def imaged(scene, path):

@@ -13,6 +13,7 @@ from PIL import Image
 from caustic_cli import cli, load
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.project import correction as corrections
+from caustic_cli.scene import Screen
 from caustic_cli.studies.photograph import inference, registration
 from caustic_cli.studies.photograph.camera import displacements, fit_camera, rectified
 from caustic_cli.studies.photograph.card import RADIUS, find_marks, marks_of_card, write_card
@@ -180,11 +181,18 @@ def test_the_marks_of_the_card_are_found_however_it_lies(lens, here):
         find_marks(np.random.default_rng(0).uniform(size=(200, 200)))
 
 
-def test_the_card_is_drawn_as_seen_from_the_lens(here):
-    write_card(Path("card.png"), Path("card.csv"), (30.0, 20.0), (1.0, 2.0))
+@pytest.mark.parametrize("radius", [np.inf, 40.0, -40.0])
+def test_the_card_is_drawn_as_seen_from_the_lens(here, radius):
+    """For a cylinder it is unrolled: seen from far away it has its marks where a plane one has them."""
+    write_card(Path("card.png"), Path("card.csv"), Screen((60.0, 40.0), 300.0, shift=(1.0, 2.0), radius=(np.inf, radius)))
     sheet = np.asarray(Image.open("card.png").convert("L"), float) / 255
+    if np.isfinite(radius):
+        high = 2.0 * 40.0 * np.arcsin(25.0 / 40.0)
+        assert sheet.shape[0] / sheet.shape[1] == pytest.approx(high / 75.0, rel=2e-3)
+        arc = 40.0 * np.arcsin(np.linspace(-25.0, 25.0, 800) / 40.0)
+        sheet = sheet[np.rint((arc / high + 0.5) * (len(sheet) - 1)).astype(int)]
     camera = find_marks(np.pad(sheet, 20, constant_values=1.0))
-    assert camera.marks == 17 and camera.mirrored and camera.sigma < 0.3
+    assert camera.marks == 17 and camera.mirrored and camera.sigma < 0.6
     table = np.loadtxt("card.csv", delimiter=",", skiprows=2)
     np.testing.assert_allclose((table - [1.0, 2.0]) / [30.0, 20.0], marks_of_card(), atol=1e-5)
 

@@ -20,7 +20,9 @@ from caustic_cli.scene import Component, FreeForm, Lens
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.studies import shop_limits
 from caustic_cli.studies.manufacture import _landings, manufacture
+from caustic_cli.studies.photograph.card import write_card
 from caustic_cli.studies.shop_page import write_page
+from caustic_cli.workflow.outputs.test_card import TestCard as Card
 
 
 @pytest.mark.parametrize("width", [0.5, 2.0])
@@ -106,11 +108,28 @@ def test_the_page_of_other_parts(changes, elements, words, tmp_path):
     scene, field, heights = make()
     scene = replace(scene, lens=replace(scene.lens, **changes), elements=elements)
     report = manufacture(scene, field, heights)
-    write_page(tmp_path / "shop.html", "a part", scene, field, heights, report, "", (50.0, 40.0), 0, False)
+    write_page(tmp_path / "shop.html", "a part", scene, field, heights, report, "", (50.0, 40.0), 0)
     text = (tmp_path / "shop.html").read_text()
-    assert (
-        not [part for part in words if part not in text] and "$" not in text and "the designer's program" not in html.unescape(text)
-    )
+    assert not [part for part in words if part not in text] and "$" not in text and "the designer's program" in html.unescape(text)
+
+
+@pytest.mark.parametrize(
+    ("screen", "words", "card"),
+    [
+        ({"radius": (math.inf, 100.0)}, ("Print the test card", "rolled to its shape"), True),
+        ({"radius": (100.0, 100.0)}, ("a sphere of radius 100 mm, its middle", "eight marks"), False),
+        ({"z": 1000.0, "far": True}, ("so far away", "mrad", "eight marks"), False),
+    ],
+    ids=["cylinder", "sphere", "far field"],
+)
+def test_the_page_says_how_to_photograph_on_other_screens(screen, words, card, tmp_path):
+    scene, field, heights = make()
+    scene = replace(scene, screen=replace(scene.screen, **screen))
+    assert Card.capability.supports(scene) == card
+    size = write_card(tmp_path / "card.png", tmp_path / "card.csv", scene.screen) if card else None
+    write_page(tmp_path / "shop.html", "a part", scene, field, heights, manufacture(scene, field, heights), "", size, 0)
+    text = html.unescape((tmp_path / "shop.html").read_text())
+    assert not [part for part in words if part not in text] and "$" not in text and ("test card" in text) == card
 
 
 def test_roughness_at_the_limit_scatters_a_hundredth():

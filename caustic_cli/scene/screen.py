@@ -28,6 +28,8 @@ from caustic_cli.schema.table import check_all, default
 MAX_SAGS = 4096
 #: Largest half extent of a spherical or cylindrical screen, as a fraction of its radius: beyond it incidence is near grazing.
 STEEPEST = 0.98
+#: A sheet around a screen over it: that of the test card.
+SHEET = 1.25
 #: Least angle between the plane of a screen and the light, degrees: a beam is there a hundred times as long as it is wide.
 GRAZING = 0.5
 #: Focal length with which lengths on a far screen are mrad, mm.
@@ -164,6 +166,18 @@ class Screen:
     def curved(self) -> bool:
         """Whether it is not plane."""
         return self.rounded or self.sags is not None
+
+    @property
+    def rolled(self) -> bool:
+        """Whether it is a cylinder, around which a sheet SHEET times as wide can be rolled."""
+        bent = [(h, abs(r)) for h, r in zip(self.half_size, self.radius, strict=True) if math.isfinite(r)]
+        return len(bent) == 1 and SHEET * bent[0][0] <= STEEPEST * bent[0][1]
+
+    def unrolled(self, x: float, y: float) -> tuple[float, float]:
+        """Where a point of its own coordinates, mm, lies on a sheet rolled around it, of a plane or a cylinder: at its arc length
+        from the middle."""
+        u, v = (c if math.isinf(r) else abs(r) * math.asin(c / abs(r)) for c, r in zip((x, y), self.radius, strict=True))
+        return u, v
 
     @property
     def upright(self) -> bool:

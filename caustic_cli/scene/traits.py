@@ -64,6 +64,7 @@ TRAITS: Mapping[str, Trait] = {
     "tilted screen": Trait("a tilted screen", lambda s: any(s.screen.tilt), ("screen.tilt",)),
     "shifted screen": Trait("a shifted screen", lambda s: any(s.screen.shift), ("screen.shift",)),
     "curved screen": Trait("a curved screen", lambda s: s.screen.curved, ("screen.radius", "screen.shape_file")),
+    "unrollable screen": Trait("a screen on which no flat sheet lies", lambda s: s.screen.curved and not s.screen.rolled),
     "far field": Trait("a picture in the far field", lambda s: s.screen.far, ("screen.far",)),
     "several sources": Trait("several sources", lambda s: len(s.source.members) > 1, ("source.also", "source.each")),
     "ray file": Trait("the rays of a file", lambda s: s.source.rays is not None, ("source.type rays",)),

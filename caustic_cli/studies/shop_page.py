@@ -25,16 +25,19 @@ POINTS = 301
 #: Radius, mm, of a side that is flat.
 FLAT = 1e6
 #: How the picture is photographed.
-STEPS = (
+CARD = (
     "Print the test card in its true size ($wide x $high mm, no scaling by the printer) on white matt paper, and measure the"
     " distance of two of its marks.",
-    "Fix it on the screen, $throw mm from the part's $face$along, square to the light, with its printed side to the lens and the"
-    " picture between the marks.",
+    "Fix it on the screen, $throw mm from the part's $face$along, $square, with its printed side to the lens and the picture"
+    " between the marks.",
+)
+NO_CARD = ("Catch the picture on a white matt surface, $place, and fix eight marks or more around it whose places are measured.",)
+STEPS = (
     "Light the part as it is meant to be: $light.",
     "Darken the room, but leave enough light that the marks are seen.",
-    "Photograph the card from the side of the lens, as nearly square as the light allows, with all marks in the picture, the camera"
-    " on a stand; nothing may be white without detail: expose so that the brightest places stay below the camera's limit.",
-    "Send the file as the camera wrote it$judged.",
+    "Photograph the screen from the side of the lens, as nearly square as the light allows, with all marks in the picture, the"
+    " camera on a stand; nothing may be white without detail: expose so that the brightest places stay below the camera's limit.",
+    "Send the file as the camera wrote it: the designer's program tells from it what is wrong with the part.",
 )
 PAGE = Template(
     """<!DOCTYPE html>
@@ -66,16 +69,14 @@ def write_page(
     heights: Tensor,
     report: dict[str, Any],
     finish: str,
-    card: tuple,
+    card: tuple[float, float] | None,
     seed: int,
-    judged: bool,
 ) -> dict[str, Any]:
     """Write the page; its `limits`.
 
     Args:
         field, heights: of the exit to be made; report: of `studies.manufacture`; finish: its steps, "" if none is foreseen.
-        card: width and height of the test card, mm; seed: of the rays; judged: whether a part can be judged by
-            its photograph.
+        card: width and height of the test card, mm, None without one; seed: of the rays.
     """
     found, lens = limits(scene, field, heights, seed), scene.lens
     light = scene.light.mean
@@ -83,15 +84,22 @@ def write_page(
     source = f"a {scene.source.kind} source as designed, " + (
         f"of {light:.0f} nm" if not several else f"white, {light:.0f} nm on average"
     )
+    screen, throw = scene.screen, f"{abs(scene.screen.z - lens.z_in):.6g}"
+    face = "flat side" if lens.entrance is None else f"plane z = {lens.z_in:g} mm"
+    along = " along the axis" if scene.elements else ""
+    shape = f"{screen.shape_words()}, its middle {throw} mm from the part's {face}{along}"
+    angles = f"so far away that the part looks small from there: the picture is one of angles, {screen.size[0]:g} x"
     words = {
-        "wide": f"{card[0]:.4g}",
-        "high": f"{card[1]:.4g}",
-        "throw": f"{abs(scene.screen.z - lens.z_in):.6g}",
-        "face": "flat side" if lens.entrance is None else f"plane z = {lens.z_in:g} mm",
-        "along": " along the axis" if scene.elements else "",
+        "wide": f"{(card or screen.size)[0]:.4g}",
+        "high": f"{(card or screen.size)[1]:.4g}",
+        "throw": throw,
+        "face": face,
+        "along": along,
+        "square": "rolled to its shape" if screen.curved else "square to the light",
+        "place": f"{angles} {screen.size[1]:g} {screen.unit}" if screen.far else shape,
         "light": source,
-        "judged": ": the designer's program tells from it what is wrong with the part" if judged else "",
     }
+    steps = [Template(step).substitute(words) for step in (*(NO_CARD if card is None else CARD), *STEPS)]
     page = PAGE.substitute(
         software=SOFTWARE,
         title=html.escape(title),
@@ -99,7 +107,7 @@ def write_page(
         drawing=base64.b64encode(_drawing(sides_of(scene, field, heights))).decode(),
         held=_table(_held(found, report)),
         finish=html.escape(_finish(finish)),
-        steps="".join(f"<li>{html.escape(Template(step).substitute(words))}</li>" for step in STEPS),
+        steps="".join(f"<li>{html.escape(step)}</li>" for step in steps),
     )
     write_bytes(path, page.encode())
     return found

@@ -29,7 +29,6 @@ from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.project import correction
 from caustic_cli.scene import Scene, Screen
-from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.photograph import comparison, inference, registration
 from caustic_cli.studies.photograph.camera import DISPLACEMENTS
 from caustic_cli.studies.photograph.model import PartModel
@@ -45,7 +44,6 @@ TAKEN = ("source", "screen")
 #: Correlation from which on two unknowns count as one.
 ALIKE = 0.9
 
-PHOTOGRAPHS = Capability("photographs of a part", {})
 #: Channels of a photograph in colour.
 CHANNELS = ("red", "green", "blue")
 #: Part of the light from which on that of a colour is judged.
@@ -202,7 +200,7 @@ def refuse_lens(lens: Lens) -> str:
     """Why no photograph of a lens can be judged, "" if it can."""
     if lens.target is None:
         return "⟨photo⟩ compares with the picture, which an archive does not hold; give its project"
-    return PHOTOGRAPHS.why_not(lens.scene)
+    return ""
 
 
 def corners_of(texts: tuple[str, ...] | None) -> np.ndarray | None:

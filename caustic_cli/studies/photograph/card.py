@@ -17,6 +17,8 @@ from scipy.spatial import ConvexHull, QhullError
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import CREATED_BY, SOFTWARE, atomic_file, write_bytes
+from caustic_cli.scene import Screen
+from caustic_cli.scene.screen import SHEET
 from caustic_cli.studies.photograph.camera import Camera, Shape, fit_camera
 
 #: Positions of the marks along an edge, in half widths of their rectangle; this rectangle over the screen; radius of a mark over
@@ -25,7 +27,7 @@ PLACES, AROUND, RADIUS = (-1.0, -0.5, 0.0, 0.5, 1.0), 1.12, 0.03
 #: Position of the further mark along the upper edge, near its -x end.
 BESIDE = -0.75
 #: Half size of the sheet over that of the screen; mm per inch; pixels along its longer side.
-EDGE, INCH, PIXELS = 1.25, 25.4, 2000.0
+EDGE, INCH, PIXELS = SHEET, 25.4, 2000.0
 #: Darkness of a mark relative to its surroundings, most candidates, and largest miss of a mark, in radii.
 DARK, MOST, MISS = 0.55, 200, 0.6
 #: Marks that may be missing, that beside the corner excepted.
@@ -129,33 +131,35 @@ def _dots(light: np.ndarray) -> np.ndarray:
     return np.array(found).reshape(-1, 3)
 
 
-def write_card(sheet: Path, table: Path, half_size: tuple[float, float], shift: tuple[float, float]) -> tuple[float, float]:
+def write_card(sheet: Path, table: Path, screen: Screen) -> tuple[float, float]:
     """Write the sheet, a PNG of its true size, and a table of its marks, mm on the screen; width and height of the sheet, mm.
 
-    It is drawn as seen from the side of the lens, +x to the left.
+    It is drawn as seen from the side of the lens, +x to the left; for a cylinder unrolled.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415
     from matplotlib.patches import Circle, Rectangle  # noqa: PLC0415
 
-    (rx, ry), radius = half_size, RADIUS * 0.5 * sum(half_size)
-    wide, high = (2.0 * EDGE * r for r in half_size)
+    (rx, ry), radius = screen.half_size, RADIUS * 0.5 * sum(screen.half_size)
+    ex, ey = screen.unrolled(EDGE * rx, EDGE * ry)
+    wide, high = 2.0 * ex, 2.0 * ey
     figure = Figure(figsize=(wide / INCH, high / INCH), dpi=float(np.clip(PIXELS * INCH / max(wide, high), 20.0, 600.0)))
     axis = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axis.set(xlim=(EDGE * rx, -EDGE * rx), ylim=(-EDGE * ry, EDGE * ry), aspect="auto")
+    axis.set(xlim=(ex, -ex), ylim=(-ey, ey), aspect="auto")
     axis.axis("off")
-    for x, y in marks_of_card() * np.array(half_size):
-        axis.add_patch(Circle((x, y), radius, color="black", linewidth=0))
+    for x, y in marks_of_card() * np.array(screen.half_size):
+        axis.add_patch(Circle(screen.unrolled(x, y), radius, color="black", linewidth=0))
     line = 0.15 * radius
     for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1)):  # the corners of the screen, outside of which nothing should be bright
         for w, h in ((0.06 * rx, line), (line, 0.06 * ry)):
-            axis.add_patch(Rectangle((a * rx, b * ry), -a * w, -b * h, color="0.6", linewidth=0))
+            axis.add_patch(Rectangle(screen.unrolled(a * rx, b * ry), -a * w, -b * h, color="0.6", linewidth=0))
     size = 72.0 * 0.7 * radius / INCH
-    marked = f"{2 * AROUND * rx:.4g} x {2 * AROUND * ry:.4g} mm"
+    marked = " x ".join(f"{2 * c:.4g}" for c in screen.unrolled(AROUND * rx, AROUND * ry)) + " mm"
     words = f"caustic test card: {wide:.4g} x {high:.4g} mm, marks on {marked}; this side to the lens"
-    axis.text(0.0, -(EDGE + AROUND) / 2 * ry - 0.3 * radius, words, ha="center", va="center", fontsize=size, color="0.4")
+    below = 0.5 * (screen.unrolled(0.0, AROUND * ry)[1] + ey)
+    axis.text(0.0, -below - 0.3 * radius, words, ha="center", va="center", fontsize=size, color="0.4")
     with atomic_file(sheet) as file:
         figure.savefig(file, format="png", metadata={"Software": SOFTWARE})
     lines = [f"# {CREATED_BY} {__version__}: marks of the test card on the screen, mm", "x,y"]
-    lines += [f"{x:.6g},{y:.6g}" for x, y in marks_of_card() * np.array(half_size) + np.array(shift)]
+    lines += [f"{x:.6g},{y:.6g}" for x, y in marks_of_card() * np.array(screen.half_size) + np.array(screen.shift)]
     write_bytes(table, ("\n".join(lines) + "\n").encode())
     return wide, high

@@ -12,7 +12,7 @@ from caustic_cli.studies.photograph import comparison
 from caustic_cli.studies.viewing import as_viewed
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
-from caustic_cli.workflow.photographs import PHOTOGRAPHS, Shot, files_of, judge, refuse_lens, shots
+from caustic_cli.workflow.photographs import Shot, files_of, judge, refuse_lens, shots
 
 
 @dataclass(eq=False)
@@ -20,7 +20,7 @@ class PartPhotograph(Output):
     """The photographs `photo`, a single one found on the screen by `marks`, a file or auto, or by `screen_corners`."""
 
     option: ClassVar[str] = "photo"
-    capability: ClassVar[Capability] = PHOTOGRAPHS
+    capability: ClassVar[Capability] = Capability("photographs of a part", {})
     files: ClassVar[tuple[str, ...]] = ("photo.png", "photo.npy", "missing.png", "part.png", "part.npy", "deviation.npy")
     beyond: ClassVar[bool] = True
 

@@ -16,7 +16,8 @@ class TestCard(Output):
 
     option: ClassVar[str] = "test_card"
     capability: ClassVar[Capability] = Capability(
-        "test cards", dict.fromkeys(("curved screen", "far field"), "a test card is a plane sheet, and this scene has {}")
+        "test cards",
+        dict.fromkeys(("unrollable screen", "far field"), "a test card is a sheet of paper, which does not lie on {}"),
     )
     files: ClassVar[tuple[str, ...]] = ("card.png", "card.csv")
     beyond: ClassVar[bool] = True
@@ -25,7 +26,7 @@ class TestCard(Output):
         """test_card: the sheet, its width and height, mm, and the table of its marks."""
         sheet, table = self.paths(rendering.place)
         screen = rendering.lens.scene.screen
-        size = write_card(sheet, table, screen.half_size, screen.shift)
+        size = write_card(sheet, table, screen)
         return {"test_card": {"sheet": str(sheet), "marks": str(table), "size_mm": list(size)}}
 
     def show(self, figures: dict[str, Any], say: Any) -> None:
