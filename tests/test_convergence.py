@@ -7,17 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers import write_blob
 from PIL import Image
 
+from caustic_cli import cli, load
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import is_ours
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import freeform_of
-from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene import Component, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import intersection
 from caustic_cli.studies.convergence import FILTERS, run_study, single_precision
+from caustic_cli.studies.efficiency import DesignedLens, run_efficiency
 from caustic_cli.studies.fit import knee, order, pareto
 from caustic_cli.studies.measurement import REFERENCE_FACTOR, Benchmark, Setting
 from caustic_cli.studies.metrics import relative_rms
@@ -286,3 +289,37 @@ def test_intersections_behind_a_free_form_entrance():
     case = intersection.of_lens(scene, HeightField.of(lens), torch.full((12, 12), 5.0, dtype=torch.float64), 500)
     x, y, z = case.rays.origin
     assert x.shape == y.shape == z.shape == case.rays.power.shape and float(z.std()) > 0
+
+
+def test_intersections_behind_another_lens():
+    """Rays reach the surface through a plane-parallel plate and the flat entrance, each by Snell's law."""
+    lens = Lens((10.0, 10.0), control=(9, 9), index=1.5, offset=Offset(5.0, (30.0, 30.0)))
+    plate = Component(-12.0, (30.0, 30.0), thickness=4.0, index=1.7)
+    scene = Scene(Points(((1.0, 2.0, -40.0),)), lens, Screen((20.0, 20.0), 100.0), elements=(plate,))
+    field = HeightField.of(lens)
+    x, y = field.control_xy()
+    case = intersection.of_lens(scene, field, 5.0 - 0.01 * (x[:, None] ** 2 + y**2), 3000)
+    truth, hit, residual = intersection.reference(case)
+    at = [
+        np.asarray(o + torch.from_numpy(truth.astype(float)) * d)[hit]
+        for o, d in zip(case.rays.origin, case.rays.direction, strict=True)
+    ]
+    ahead = np.array([np.asarray(c)[hit] for c in case.rays.direction[:2]]) * lens.index  # invariant at parallel planes
+    tangent = lambda n: ahead / np.sqrt(n * n - (ahead**2).sum(0))  # noqa: E731
+    start = np.array([[1.0], [2.0]])
+    there = start + (40.0 - 4.0) * tangent(1.0) + 4.0 * tangent(1.7) + at[2] * tangent(1.5)  # the entrance is at z = 0
+    assert np.abs(there - np.array(at[:2])).max() < 1e-12 and residual < 1e-12 and hit.sum() > 100
+
+
+def test_the_lenses_of_a_study_are_traced_with_all_their_surfaces(tmp_path, monkeypatch):
+    """One whose second lens is free-form, too: its error is that of the finished project, rendered as such."""
+    monkeypatch.chdir(tmp_path)
+    write_blob()
+    other = "lens z=60 size=30x30 radius=200,-200 thickness=4 free=back"
+    usual = ["--quality", "draft", "--waves", "off", "--resolution", "16", "--iterations", "1", "--quiet"]
+    assert cli.run(["design", "blob.png", *usual, "--element", other, "-o", "p"]) == 0
+    lens = load("p")
+    made = DesignedLens(5.0, 0.0, "rms", lens.project.scene(), lens.field, lens.state.heights, lens.target, 0.0)
+    assert lens.state.heights.ndim == 3
+    row = run_efficiency([made], 1, rays=100_000).rows[0]
+    assert row["error"] == pytest.approx(lens.render(rays=100_000, effects="none").figures["relative_rms"], rel=0.05)

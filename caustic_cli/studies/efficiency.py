@@ -19,6 +19,7 @@ from caustic_cli import __version__
 from caustic_cli.effort import current_effort
 from caustic_cli.errors import CausticError
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import trace_arguments
 from caustic_cli.scene import Scene
 from caustic_cli.schema import checks
 from caustic_cli.studies.fit import pareto
@@ -49,9 +50,9 @@ COLUMNS = {
 
 @dataclass(frozen=True, eq=False)
 class DesignedLens:
-    """A designed lens: its thickness, mm, the weight of the light, the loss, the scene, the spline spaces and heights (n, m) mm,
-    the target (n_x, n_y), and the seconds its iterations took; of a shaped laser beam the wanted efficiency in place of the weight,
-    and figures by its wave image, as of `beam.beam_figures`."""
+    """A designed lens: its thickness, mm, the weight of the light, the loss, the scene, the spline spaces and heights (n, m) mm, or
+    those of all surfaces (k, n, m), the target (n_x, n_y), and the seconds its iterations took; of a shaped laser beam the wanted
+    efficiency in place of the weight, and figures by its wave image, as of `beam.beam_figures`."""
 
     thickness: float
     weight: float
@@ -88,7 +89,8 @@ def run_efficiency(
         usual = min(current_effort().final_rays, RAYS_PER_PIXEL * lens.target.size)
         traced = checks.whole("⟨rays⟩", usual if rays is None else rays, 256, 1 << 32)
         if lens.shaped is None:
-            _, figures = retrace(lens.scene, lens.field, lens.heights, lens.target, rays=traced, seed=seed, device=device)
+            made = trace_arguments(lens.scene, lens.field, lens.heights)
+            _, figures = retrace(*made, lens.target, rays=traced, seed=seed, device=device)
         else:
             part = lens.shaped["in_region"]
             figures = {"relative_rms": lens.shaped["error"], "noise": 0.0, "on_screen": part, "of_source": part}

@@ -117,7 +117,7 @@ def of_lens(scene: Scene, field: HeightField, heights: Tensor, rays: int | None 
     source = scene.source.label
     if scene.source.collimated:
         away = AWAY * max(scene.lens.size)
-        scene = replace(scene, source=Points(((0.0, 0.0, scene.lens.z_in - away),)))
+        scene = replace(scene, source=Points(((0.0, 0.0, scene.pupil.z - away),)))
         source = f"a point on the axis, {away:g} mm before the lens, as rays along z need no search"
     sampler = rays_of(scene, "uniform", rays or RAYS, seed)
     entered = Tracer(System.of(scene, field), next(iter(sampler.chunks(sampler.count)))).start.counted_from(0.0)
@@ -178,7 +178,7 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray, float]:
 def _above(case: Case, t: np.ndarray) -> np.ndarray:
     """f(t) (N,), mm: height of the rays above the surface at t (N,) longdouble."""
     x, y, dx, dy, dz = (c.numpy().astype(np.longdouble) for c in (*case.rays.origin[:2], *case.rays.direction))
-    return case.rays.origin[2] + t * dz - exact_heights(case.field, case.heights, x + t * dx, y + t * dy)
+    return np.asarray(case.rays.origin[2]) + t * dz - exact_heights(case.field, case.heights, x + t * dx, y + t * dy)
 
 
 def settings_of(field: HeightField, most: int | None = None) -> list[tuple[str, int | None]]:

@@ -21,6 +21,7 @@ from torch import Tensor
 from caustic_cli import __version__
 from caustic_cli.effort import current_effort
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import trace_arguments
 from caustic_cli.scene import Scene
 from caustic_cli.schema import checks
 from caustic_cli.studies.report import Study, draw_front, legend_beside, plain_ticks
@@ -54,8 +55,9 @@ COLUMNS = {
 class DesignRun(Protocol):
     """A design that is advanced in time slices.
 
-    series, optimizer, network: see COLUMNS; heights (n, m) mm over `field`; seconds, iterations: spent so far; steps: seconds of
-    every iteration so far; loss: the last iteration's, times the pixels; done: no further improvement is possible.
+    series, optimizer, network: see COLUMNS; heights (n, m) mm over `field`, or of all surfaces (k, n, m); seconds, iterations:
+    spent so far; steps: seconds of every iteration so far; loss: the last iteration's, times the pixels; done: no further
+    improvement is possible.
     """
 
     series: str
@@ -113,7 +115,8 @@ def run_comparison(
     def evaluate() -> None:
         for table, c in zip(tables, runs, strict=True):
             if not table or c.iterations > table[-1]["iterations"]:
-                _, figures = retrace(scene, c.field, c.heights, target, rays=rays, seed=seed, device=device, noise=False)
+                lens = trace_arguments(scene, c.field, c.heights)
+                _, figures = retrace(*lens, target, rays=rays, seed=seed, device=device, noise=False)
                 table.append(_row(c, figures["relative_rms"]))
 
     evaluate()
@@ -147,7 +150,7 @@ def _row(c: DesignRun, error: float) -> dict:
         "series": c.series,
         "optimizer": c.optimizer,
         "network": c.network,
-        "control": "x".join(map(str, c.heights.shape)),
+        "control": "x".join(map(str, c.heights.shape[-2:])),
         "iterations": c.iterations,
         "seconds": c.seconds,
         "iteration": statistics.median(steps) if steps else None,

@@ -18,15 +18,10 @@ from caustic_cli.io.picture import Picture
 from caustic_cli.kinds import OneSurface, problem_of
 from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
-from caustic_cli.scene.traits import Capability
 from caustic_cli.workflow.comparison import picture_of_disc
 from caustic_cli.workflow.preparation import first_heights
 
 BY_RAYS = "⟨networks⟩ are compared on ray images, and no stage of this project is on rays"
-NETWORKS = Capability(
-    "study of networks",
-    {"lenslet array": "⟨networks⟩ are compared on a single surface, and every lenslet has its own"},
-)
 #: Grid of hyperparameters: hidden layers, neurons in each, activations, learning rates, and preconditioners of the output.
 LAYERS, WIDTHS, ACTIVATIONS, RATES = (1, 2, 3), (16, 64, 256), ("tanh", "silu"), (3e-4, 1e-3, 3e-3)
 OUTPUTS = ("none", "laplacian")
@@ -100,7 +95,7 @@ def candidates(
     for each value.  Otherwise networks start from the offset surface, and the baselines are free heights by Adam.
 
     Raises:
-        InputError: no stage is on rays, or there are lenslets.
+        InputError: no stage is on rays.
     """
     study = _Study(project, device, dtype, seed, rays)
     own, over = study.own, study.over
@@ -139,7 +134,6 @@ class _Study:
         scene, stages, own = self.problem.scene, [s for s in self.problem.stages if not s.waves], self.problem.options
         if not stages:
             raise InputError(BY_RAYS)
-        NETWORKS.refuse(scene)
         last, control = stages[-1], scene.lens.control
         how = replace(last.rendering, blur=0.0)
         self.stage = replace(last, rendering=how, iterations=10**9, tolerance=0.0, source=None, spread=False, control=control)

@@ -27,8 +27,6 @@ PLACES = (
     "export.supported:EXPORT",
     "export.supported:MOULD",
     "export.supported:SCRIPT",
-    "workflow.convergence:STUDIES",
-    "workflow.architectures:NETWORKS",
 )
 
 

@@ -5,8 +5,8 @@ What they are called and which options they take is known without torch: what a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from caustic_cli.optics.surfaces.heightfield import HeightField
     from caustic_cli.project.project import Project
     from caustic_cli.scene import Scene
-    from caustic_cli.scene.traits import Capability
     from caustic_cli.studies.report import Drawing, Study
     from caustic_cli.workflow.lens import Lens
     from caustic_cli.workflow.reporter import Reporter
@@ -61,9 +60,6 @@ class StudyRequest:
         return scene, field, heights.to(self.device)
 
 
-SINGLE = "⟨study⟩ {study} supports single lenses only, and this scene has [[element]] tables; studies of such scenes are {others}"
-
-
 class StudyKind:
     """A study."""
 
@@ -80,8 +76,6 @@ class StudyKind:
     of_lenses: ClassVar[bool] = False
     #: Whether it can study the lens of a project.
     takes_project: ClassVar[bool] = True
-    #: Messages for traits of scenes that it does not support, see `scene.traits`.
-    unsupported: Mapping[str, str] = {"other elements": SINGLE}
 
     @property
     def module(self) -> Any:
@@ -93,13 +87,6 @@ class StudyKind:
         """Endings of its plots' names, and what draws them; None for the usual one."""
         return getattr(self.module, "PLOTS", None)
 
-    @property
-    def capability(self) -> Capability:
-        """The scenes that it supports."""
-        from caustic_cli.scene.traits import Capability  # noqa: PLC0415
-
-        return Capability(f"study of {self.name}", self.unsupported)
-
     def measure(self, asked: StudyRequest) -> Study:
         """Run it.
 
@@ -108,13 +95,6 @@ class StudyKind:
         """
         from caustic_cli.workflow.compilation import compile_usual  # noqa: PLC0415
 
-        if asked.lens:
-            others = ", ".join(
-                kind.name for kind in STUDIES.values() if kind.takes_project and "other elements" not in kind.unsupported
-            )
-            self.capability.refuse(asked.lens.scene, study=self.name, others=others)
-            if "other elements" in self.unsupported:
-                asked = replace(asked, lens=replace(asked.lens, scene=asked.lens.scene.unfolded))
         compile_usual(asked.device, asked.say)
         return self.run(asked)
 
@@ -138,7 +118,6 @@ class ImageStudy(StudyKind):
     """Settings of an image, see `studies.convergence`; by default of the initial sphere of a design."""
 
     home, takes, rays_of_all = "convergence", ("repeats", "dtype"), True
-    unsupported: Mapping[str, str] = {}
 
     def __init__(self, name: str):
         self.name = name
@@ -156,7 +135,6 @@ class EffectStudy(StudyKind):
     """Effects on and off; by default of the initial sphere of a design."""
 
     name, home, unit, takes, rays_of_all = "effects", "effects", "effects", ("repeats", "dtype"), True
-    unsupported: Mapping[str, str] = {}
 
     def run(self, asked: StudyRequest) -> Study:
         from caustic_cli.workflow.compilation import compile_for  # noqa: PLC0415
@@ -197,8 +175,6 @@ class DiffractionStudy(StudyKind):
 
     name, home, unit, takes = "diffraction", "diffraction", "cases", ("dtype",)
 
-    unsupported: Mapping[str, str] = {}
-
     def run(self, asked: StudyRequest) -> Study:
         from caustic_cli.workflow.comparison import lens_of_disc  # noqa: PLC0415
 
@@ -224,7 +200,6 @@ class StabilityStudy(StudyKind):
 
     name, home, unit = "stability", "stability", "cases"
     takes_project = False
-    unsupported: Mapping[str, str] = {}
 
     def measure(self, asked: StudyRequest) -> Study:
         for option, value in (("PROJECT", asked.lens), ("⟨rays⟩", asked.rays)):
