@@ -5,6 +5,7 @@ import json
 import re
 import shlex
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,10 +28,12 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.lens import array_control
+from caustic_cli.scene.light import RGB
 from caustic_cli.studies.brightness import brightness
 from caustic_cli.studies.retrace import retrace
+from caustic_cli.workflow.outputs import illumination
 
 
 def array_scene(array=(3, 2), spans=5, degree=(3, 2), profile=None, **lens) -> Scene:
@@ -286,6 +289,27 @@ def test_brightness_for_a_wanted_illumination(arrays, monkeypatch, capfd):
     assert "KKT residual" in run("render sheet.caustic --want goal.png --rays 2e5 --effects none", capfd)[1]
     with Image.open("sheet.caustic/wanted.png") as image:
         assert image.size == (32, 32)
+
+
+def test_brightness_of_each_colour(arrays, monkeypatch, tmp_path):
+    """Two lenslets with images of their own, beside each other but for a common column: each colour is solved by itself."""
+    own = replace(caustic.load(arrays / "sheet.caustic").scene.lens, array=(2, 1))
+    light = Light(wavelengths=RGB, weights=(1.0, 2.0, 1.0), color=True)
+    scene = replace(caustic.load(arrays / "sheet.caustic").scene, lens=own, light=light)
+    left, right = np.zeros((8, 6)), np.zeros((8, 6))
+    left[:4], right[4:] = 1.0 / 24, 1.0 / 24
+    parts = np.array([0.25, 0.5, 0.25])[:, None, None]
+    images = [(0.4, 0.4 * parts * left), (0.6, 0.6 * parts * right)]
+    monkeypatch.setattr(illumination, "_images", lambda rendering: iter(images))
+    output = illumination.Illumination(tmp_path / "goal.png")
+    asked = np.array([[0.5, 0.0], [0.25, 1.0], [1.0, 0.5]])
+    output.target = sum(asked[:, k, None, None] * images[k][1] for k in (0, 1))
+    place = SimpleNamespace(beside=lambda name: tmp_path / name)
+    found = output.write(SimpleNamespace(scene=scene, place=place, lens=SimpleNamespace(encoding="srgb")))["want"]
+    assert np.array(found["brightness"]) == pytest.approx(asked[:, :, None]) and found["error"] < 1e-12
+    assert found["power"] == pytest.approx(float((parts[:, :, 0] * asked * [0.4, 0.6]).sum()))
+    with Image.open(tmp_path / "wanted.png") as image:
+        assert image.mode == "RGB"
 
 
 def test_brightness_is_what_a_profile_of_the_beam_does(arrays, monkeypatch):

@@ -192,7 +192,7 @@ class Project:
         t, light = self.settings.target, self.picture.irradiance()
         if t.sheet:
             return np.mean([own / own.sum() for own in self.targets(scene)], axis=0)
-        return self._of_picture(light, t.size, scene.screen, scene.light)
+        return self.of_picture(light, t.size, scene.screen, scene.light)
 
     def second_target(self, scene: Scene) -> np.ndarray | None:
         """The second target on its screen, (n_x, n_y), or (3, n_x, n_y) in the colours of the first, or None.
@@ -203,13 +203,13 @@ class Project:
         picture, section = self.second, self.settings.second
         if picture is None or section is None or scene.second_target is None or scene.second_target.screen is None:
             return None
-        found = self._of_picture(picture, section.size, scene.second_target.screen, scene.light)
+        found = self.of_picture(picture, section.size, scene.second_target.screen, scene.light)
         for wavelength, part, goal in zip(scene.light.wavelengths, scene.light.fractions, found, strict=False):
             if scene.colored and goal.any() and not part:
                 raise InputError(f"⟨second.file⟩ needs light of {wavelength:g} nm, of which the source of both pictures has none")
         return found
 
-    def _of_picture(self, picture: np.ndarray, size: tuple[float, float], screen: Screen, light: Light) -> np.ndarray:
+    def of_picture(self, picture: np.ndarray, size: tuple[float, float], screen: Screen, light: Light) -> np.ndarray:
         """A picture (a, b), or R, G, B (3, a, b), on a screen: (n_x, n_y), or (3, n_x, n_y), the power of each wavelength."""
         flip = self.settings.target.flip
         if not self.settings.target.color:
