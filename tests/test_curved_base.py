@@ -511,7 +511,7 @@ def test_project_keeps_its_face(tube, tmp_path):
         (["--base-radius=-30", "--mirror"], "light never enters a mirror"),
         (["--base-radius=-30", "--collimate"], "designs the entrance"),
         (["--base-radius=-30", "--array", "2x2"], "is of one lens"),
-        (["--base-radius=-30", "--element", "mirror z=50 tilt=45,0"], "is not implemented beside other lenses"),
+        (["--base-radius=-30", "--element", "mirror z=50 tilt=45,0"], "is of a lens by itself"),
         (["--base-radius=-10", "--lens-size", "20"], "must exceed the lens' semi-aperture"),
         (["--base-radius=-30,inf", "--relief", "0.1,0"], "must ascend"),
         (["--base-radius=x"], "with inf for straight"),

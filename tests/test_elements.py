@@ -3,10 +3,12 @@
 import json
 import math
 import re
+import sys
 import tomllib
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,17 +38,21 @@ from caustic_cli.optics.misalignment import Misalignment, landing_points
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces import HeightField, Sphere
 from caustic_cli.optics.system import ENTRANCE, EXIT, PlacedScreen, System, split_heights
 from caustic_cli.optics.trace import Tracer, expose, render
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Aperture, Component, FoldMirror, Lens, Light, Offset, PlaneWave, Points, Pupil, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.studies.effects import _row
 from caustic_cli.studies.retrace import retrace
-from caustic_cli.workflow.convergence import STUDIES
+
+sys.path.insert(0, str(Path(__file__).parent / "independent"))
+from photographs import lattice, leaving
 
 PIXELS = 32
 LENS = Lens((10.0, 10.0), control=(35, 35), offset=Offset(5.0), fresnel="none")
@@ -531,9 +537,8 @@ def test_a_study_of_effects_leaves_out_what_other_elements_exclude():
     plan = compile_plan(scene, FIELD, wavy())
     asked = {one.name: k for k, one in enumerate(plan.effects) if one.name in ("gradient-index", "mirror", "absorption", "fresnel")}
     rows = {name: _row(plan, scene, FIELD, wavy(), 500, [1, 1], 0, torch.float64, k) for name, k in asked.items()}
-    assert rows.pop("gradient-index") is None and rows.pop("mirror") is None
-    assert len(rows) == 2 and all(row is not None for row in rows.values())
-    assert STUDIES["effects"].capability.supports(scene)
+    assert rows.pop("mirror") is None
+    assert len(rows) == 3 and all(row is not None for row in rows.values())
 
 
 @pytest.mark.parametrize("aperture", ["rectangle", "circle"])
@@ -666,7 +671,6 @@ def test_an_archive_holds_the_glass_of_every_lens(tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--gradient", "selfoc", "--gradient-terms", "0.02"), "--gradient selfoc cannot be combined with --element"),
         (("--mirror",), "--mirror cannot be combined with --element"),
         (("--element", "lens z=60 free=front", "--collimate"), "--collimate"),
         (("--element", "lens z=60 free=front", "--network", "sparse"), "--network sparse cannot be combined with [[element]] free"),
@@ -758,17 +762,59 @@ def test_bad_elements_are_refused(_here, capfd, text, words):
     assert not Path("one.caustic").exists()
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ("--mirror",),
-        ("--array", "2"),
-        ("--gradient", "selfoc", "--gradient-terms", "0.01"),
-    ],
-)
-def test_what_elements_cannot_be_had_with_is_refused(_here, capfd, options):
-    said = run(capfd, "design", "one.png", *SMALL[:-2], "--element", FIELD_LENS, *options, code=2)
-    assert "element" in said and len(said.splitlines()) == 1
+def test_a_mirror_sends_light_back_through_other_elements_and_is_refused(_here, capfd):
+    said = run(capfd, "design", "one.png", *SMALL[:-2], "--element", FIELD_LENS, "--mirror", code=2)
+    assert "sends light back" in said and len(said.splitlines()) == 1
+
+
+#: A plane-parallel plate, 20 mm of index 1.6.
+PLATE = Component(30.0, (60.0, 60.0), 20.0, index=1.6)
+
+
+def plated(lens, heights=None):
+    """Landing points behind PLATE and directions of a plane wave behind a lens, by the independent tracer."""
+    made = SimpleNamespace(field=HeightField.of(lens), scene=replace(SCENE, lens=lens))
+    x, y = lattice(made, 40)
+    start, ahead = np.stack([x, y, 0.0 * x]), np.stack([0.0 * x, 0.0 * x, 1.0 + 0.0 * x])
+    index = (lambda p: lens.index + 0.004 * p[2]) if lens.gradient is not None else lens.index
+    point, ahead = leaving(made, heights, None, start, ahead, index)
+    straight = (SCREEN.z - 20.0 - point[2]) / ahead[2]
+    within = 20.0 / np.sqrt(1.6**2 - ahead[0] ** 2 - ahead[1] ** 2)
+    return np.array([point[k] + (straight + within) * ahead[k] for k in (0, 1)]), ahead
+
+
+@pytest.mark.parametrize("kind", ["gradient", "lenslets", "far field"])
+def test_what_a_lens_has_it_has_beside_other_elements(kind):
+    """Light lands where Snell's law at the exit and at both sides of a plate takes it, in the far field by its direction alone."""
+    change = {"gradient": {"gradient": Gradient("axial", (0.004,))}, "lenslets": {"array": (2, 2)}}.get(kind, {})
+    lens = replace(LENS, **change)
+    screen = Screen((200.0, 200.0), 1000.0, (8, 8), far=True) if kind == "far field" else SCREEN
+    scene, field = Scene(PlaneWave(), lens, screen, elements=(PLATE,)), HeightField.of(lens)
+    x, y = field.control_xy()
+    heights = 5.0 - 0.004 * (x[:, None] ** 2 + y**2) + 0.02 * torch.sin(x[:, None]) * torch.cos(0.7 * y)
+    landing, ahead = plated(lens, heights)
+    expected = 1e3 * ahead[:2] if kind == "far field" else landing
+    rays = RayState.on_axis(_lattice_sample(40), lens.half_size, scene.pupil.z).expanded()
+    found = Tracer(System.of(scene, field), rays).land({EXIT: heights}, screen)[0]
+    at = np.array([np.asarray(c) for c in found.origin[:2]])
+    assert np.abs(at - expected).max() < 5e-5 and expected.std() > 1.0
+
+
+def _lattice_sample(count):
+    """The same lattice as samples of the aperture, from 0 to 1."""
+    u = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    u, v = (c.reshape(-1) for c in torch.meshgrid(u, u, indexing="ij"))
+    return Sample(u, v, False, torch.ones_like(u))
+
+
+def test_waves_in_the_far_field_do_not_notice_a_plate():
+    """It delays and displaces them; their angles are those behind the lens alone."""
+    screen = Screen((120.0, 120.0), 1000.0, (PIXELS, PIXELS), far=True)
+    alone = Scene(PlaneWave(), LENS, screen, INFRARED)
+    heights = wavy()
+    one, other = (wave_image(scene, FIELD, heights).image for scene in (alone, replace(alone, elements=(PLATE,))))
+    assert float((one - other * (one.sum() / other.sum())).norm() / one.norm()) < 1e-3
+    assert float(other.sum() / one.sum()) == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_screen_where_the_lens_is_imaged_is_refused():

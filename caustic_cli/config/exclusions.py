@@ -5,7 +5,6 @@ from __future__ import annotations
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.optics.waves.unsupported import WAVES_BY_DEFAULT
-from caustic_cli.scene.elements import NOT_BESIDE
 from caustic_cli.scene.traits import TRAITS, Capability
 from caustic_cli.schema.table import TABLE, default
 
@@ -48,7 +47,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
         "lens.mirror": "⟨lens.entrance⟩ parallel needs a lens: light never enters a mirror",
         "lens.gradient": "⟨lens.entrance⟩ parallel cannot be combined with ⟨lens.gradient⟩, whose index counts from a flat side",
         "lens.array": "⟨lens.entrance⟩ parallel is of one lens: on an array every lenslet has a base surface of its own",
-        "element": "⟨lens.entrance⟩ parallel" + NOT_BESIDE,
+        "element": "⟨lens.entrance⟩ parallel cannot be combined with ⟨element⟩: it is of a lens by itself",
         **dict.fromkeys(
             TRAITS["two sides"].settings,
             "⟨{path}⟩ designs the entrance, which ⟨lens.entrance⟩ parallel gives: one of them is possible",
@@ -61,7 +60,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
         "source.spectrum": "⟨source.spectrum⟩ is not for a coloured picture, whose three wavelengths are its colours",
     },
     **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
-    "element": {"lens.gradient": "{said}" + NOT_BESIDE},
+    "element": {"lens.gradient free": "{said} cannot be combined with ⟨element⟩: it is designed for light that goes straight on"},
     "element.free": dict.fromkeys(
         ("design.network", "design.optimizer", "target.color", "design.waves on"),
         "{said} cannot be combined with ⟨element.free⟩: it is not implemented beside other free surfaces",

@@ -53,6 +53,7 @@ INDEX_DESIGN = Capability(
     {
         "far field": "⟨lens.gradient⟩ free is designed for a screen at a distance, not for ⟨+throw⟩ inf",
         "light not parallel": "⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane",
+        **dict.fromkeys(("other elements", "folded axis"), "⟨lens.gradient⟩ free is designed for light that goes straight on"),
         **dict.fromkeys(
             ("mirror", "coloured picture"), "⟨lens.gradient⟩ free is designed for lenses, and for pictures without colours"
         ),

@@ -285,11 +285,10 @@ def check_positions(elements: Sequence[Component], lens: tuple[float, float], so
         )
 
 
-NOT_BESIDE = " cannot be combined with ⟨element⟩: it is not implemented beside other lenses and mirrors"
 BESIDE_ELEMENTS = Capability(
     "other elements",
     {
-        **dict.fromkeys(("mirror", "gradient index", "lenslet array"), "⟨{setting}⟩" + NOT_BESIDE),
-        "far field": "⟨+throw⟩ inf, a picture in the far field," + NOT_BESIDE,
+        "mirror": "⟨{setting}⟩ cannot be combined with ⟨element⟩: it sends light back through what stands before it, and elements"
+        " are passed once"
     },
 )

@@ -28,7 +28,6 @@ from caustic_cli.optics.receiver import Receiver
 from caustic_cli.optics.spread import POINT, Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
-from caustic_cli.optics.waves.imaged_exit import ImagedExit
 from caustic_cli.optics.waves.planes import PlanesExposure, power_by_planes
 from caustic_cli.optics.waves.propagation import (
     TURN,
@@ -313,7 +312,7 @@ class Imager:
     """Common settings of the images of a source's lines and modes: the computed region and the sampling.
 
     spread: point-spread function of a mode; each: modes per position of the source, 0 for a single mode of the whole source;
-    imaged: see `Optics`;
+    first: the optics of a line and a mode, of which those of others differ in nothing else;
     perturbation: additional height of the exit at points (N,), mm: fine structure of small amplitude, which changes optical
     paths to first order and does not deflect rays.
     """
@@ -325,7 +324,7 @@ class Imager:
     spread: Spread
     nodes: tuple[int, int]
     each: int
-    imaged: ImagedExit | None = None
+    first: Optics
     exact: bool = False
     tapered: bool = True
     perturbation: Perturbation | None = None
@@ -356,7 +355,7 @@ class Imager:
         ways = [group[0] for group in _alike(lines)]
         system, plane = ways[0].system, receiver.plane
         alike = [Optics.of(system, central_mode(system), parameters, ways[0], plane)]
-        distance, imaged = alike[0].distance, alike[0].imaged
+        distance = alike[0].distance
         alike += [replace(alike[0], system=k.system, wavelength=k.length, label=k.label) for k in ways[1:]]
         outer = outermost_modes(system)
         surveys = [survey(replace(one, mode=mode)) for one in alike for mode in (one.mode, *outer)]
@@ -375,7 +374,7 @@ class Imager:
         nodes, enough = sampling.count, max(LEAST_NODES, A_SPAN * max(finest))
         if not dense:
             nodes = min(nodes[0], enough), min(nodes[1], enough)
-        return cls(system.source, receiver, surveys[0], sampling, spread, nodes, each, imaged, exact, watched is None)
+        return cls(system.source, receiver, surveys[0], sampling, spread, nodes, each, alike[0], exact, watched is None)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
         """The wave image of these lines, at heights {name: (n, m) mm} close to those for which the sampling was chosen."""
@@ -412,8 +411,8 @@ class Imager:
 
     def optics(self, line: Line, mode: Mode, parameters: Parameters) -> Optics:
         """The wavefront computation of one mode."""
-        plane, far = self.receiver.plane, self.sampling.distance
-        return Optics(line.system, mode, parameters, line.length, line.label, plane, far, self.imaged)
+        first = self.first
+        return replace(first, system=line.system, mode=mode, parameters=parameters, wavelength=line.length, label=line.label)
 
     def front(self, line: Line, mode: Mode, parameters: Parameters, sensitive: bool = False) -> Wavefront:
         """The wavefront of a mode behind the lens, on `nodes`."""

@@ -33,6 +33,21 @@ IMAGED = 1e-3
 IS_IMAGED = "the screen is conjugate to the lens through the elements behind it, so that its wave image is that of its surface"
 
 
+def conjugate_of(at: tuple[Tensor, Tensor], behind: tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]) -> float:
+    """Distance of the image of the exit from a plane behind the last element, over a unit of slopes.
+
+    Args:
+        at: points of the exit, x and y, mm, (N,) each; behind: along each axis, where the same rays pass the plane, mm, and their
+            slopes there in any unit, (N,) each: those through one point of the exit pass one point of its image.
+    """
+    found = []
+    for x, (there, slope) in zip(at, behind, strict=True):
+        by = torch.stack([there, slope, torch.ones_like(there)], -1)
+        a, b, _ = torch.linalg.lstsq(by, x[:, None], driver="gelsd").solution[:, 0].tolist()
+        found.append(b / a)
+    return 0.5 * sum(found)
+
+
 @dataclass(frozen=True)
 class ImagedExit:
     """The coefficients s D, L and s c along both axes; see the module."""

@@ -45,7 +45,7 @@ from caustic_cli.optics.receiver import NormalPlane, dot
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.optics.waves.imaged_exit import ImagedExit
+from caustic_cli.optics.waves.imaged_exit import ImagedExit, conjugate_of
 from caustic_cli.optics.waves.interpolation import FineWavefront, Lit, extrapolated, interpolate, lagrange_weights
 from caustic_cli.optics.waves.ray_aiming import aimed_rays
 from caustic_cli.optics.waves.unsupported import NoWaveImage
@@ -128,11 +128,13 @@ class Optics:
     plane: NormalPlane
     distance: float
     imaged: ImagedExit | None = None
+    #: Distance of the far field's plane of reference behind the last surface, mm.
+    beyond: float = 0.0
 
     @classmethod
     def of(cls, system: System, mode: Mode, parameters: Parameters, line: Any, plane: NormalPlane) -> Optics:
         """Of a spectral line (`image.Line`), with the distance of the plane from the last surface, or of its image behind the
-        exit."""
+        exit; for the far field with that image as plane of reference."""
         self = cls(system, mode, parameters, line.length, line.label, plane, distance_of(system, parameters, plane))
         if EXIT not in [e.name for e in system.elements[:-1]]:
             return self
@@ -143,6 +145,9 @@ class Optics:
             if int(lit.sum()) < LEAST_LIT:
                 raise NoWaveImage(DARK)
             at = tuple(c.expand(lit.shape)[lit] for c in left.hit.local[:2])
+            if plane.far:
+                waist = ((f.x[lit], f.big_x[lit]), (f.y[lit], f.big_y[lit]))
+                return replace(self, beyond=conjugate_of(at, waist) * self.distance)
             imaged = ImagedExit.fitted(at, (f.big_x[lit], f.big_y[lit]), (f.qx[lit], f.qy[lit]), self.distance)
         return replace(self, distance=imaged.distance, imaged=imaged)
 
@@ -196,7 +201,7 @@ class Optics:
         qx, qy, qz = (sum(a * b for a, b in zip(d, e, strict=True)) for e in (e1, e2, e3))
         height = sum(a * b for a, b in zip(o, e3, strict=True))
         if self.plane.far:
-            t = (vertex_of(self.system, self.parameters, self.plane) - height) / qz
+            t = (vertex_of(self.system, self.parameters, self.plane) + self.beyond - height) / qz
             ahead = (qz > 0) & torch.isfinite(t)
             t, power = torch.where(ahead, t, torch.zeros_like(t)), torch.where(ahead, state.power, torch.zeros_like(state.power))
             x, y = (sum(a * b for a, b in zip(o, e, strict=True)) + t * q for e, q in ((e1, qx), (e2, qy)))
