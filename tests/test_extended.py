@@ -31,8 +31,9 @@ from caustic_cli.optics.spread import Convolution, Spread
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
-from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Component, Disc, FoldMirror, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.several import Several
 from caustic_cli.studies.metrics import relative_rms
 
 SMALL = ["--lens-size", "2", "--throw", "60", "--mag", "2", "--resolution", "32", "--quiet", "--threads", "1"]
@@ -232,6 +233,42 @@ def test_a_blurred_render_is_added_up_to_pixels_whatever_it_is_cut_into():
     )
     image = expose(scene, field, heights, rays_of(scene, "sobol", 1 << 18)).image
     assert kernels[0].cut == 3 and made(heights).loss * 32**2 == pytest.approx(relative_rms(image, target), rel=0.05)
+
+
+#: Scenes in which light goes on behind the lens, or onto a screen that is not plane.
+BEHIND = {
+    "a lens": {"elements": (Component(20.0, (12.0, 12.0), 3.0, (60.0, -60.0)),)},
+    "a mirror": {"elements": (FoldMirror(30.0, (20.0, 20.0), tilt=(45.0, 0.0)),)},
+    "a sphere": {"screen": Screen((5.0, 5.0), 60.0, (32, 32), radius=(8.0, 8.0))},
+}
+
+
+@pytest.mark.parametrize("name", BEHIND)
+def test_the_blur_is_that_on_the_screen_behind_everything(name):
+    """The convolved image of the source's centre is that of very many rays drawn from all of the source."""
+    scene = replace(scene_of(SOURCES["sun"]), **BEHIND[name])
+    field, heights = HeightField.of(scene.lens), heights_of(scene)
+    spread = source_spread(scene, field, heights)
+    stage = Stage((19, 19), 200_000, "grid", LossImage(oversample=4), spread=True)
+    traced, rays, (kernel,) = regular_rays(scene, spread, stage, 0, "cpu")
+    wide, cut = kernel.beside, kernel.cut
+    own = scene.screen.grown((wide[0] // cut, wide[1] // cut))
+    cells = replace(own, resolution=(own.resolution[0] * cut, own.resolution[1] * cut))
+    found = kernel(expose(traced.onto(cells), field, heights, rays).image)
+    drawn = expose(scene, field, heights, rays_of(scene, "sobol", 1 << 18)).image
+    sharp = expose(traced, field, heights, rays).image
+    assert relative_rms(found, drawn) < 0.08 and relative_rms(sharp, drawn) > 2.0 * relative_rms(found, drawn)
+
+
+def test_limits_of_several_sources_hold_for_the_light_of_all():
+    """Of a source twice it is that of it once; of another as well no more than that of either; of a point there is none."""
+    wide, narrow = Disc(angle=2.0), Disc(angle=1.5)
+    found = [performance_limits(scene_of(one), disc_on(32)).error for one in (wide, narrow)]
+    both = [
+        performance_limits(scene_of(Several(pair, (((), ()),) * 2)), disc_on(32)).error
+        for pair in ((wide, wide), (wide, narrow), (narrow, PlaneWave()))
+    ]
+    assert both[0] == pytest.approx(found[0], rel=0.05) and 0.0 < both[1] <= 1.02 * min(found) and both[2] is None
 
 
 @pytest.mark.parametrize("kind", SOURCES)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -24,7 +25,6 @@ REACHABILITY = Capability(
     {
         "mirror": "reflection deflects by any angle",
         "ray file": "its rays are followed by the design itself",
-        "separate places": "each of its sources would have to be followed",
     },
 )
 
@@ -43,10 +43,10 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
         InputError: no light falls on the lens, or none of it can be deflected far enough.
     """
     lens, limit = scene.lens, scene.lens.interaction.largest_deflection(scene.lens.index)
-    if not REACHABILITY.supports(scene):
+    if not all(map(REACHABILITY.supports, scene.by_source)):
         return
     goal, most, lit = _lit(scene, target), -1.0, False
-    for x, y, d in _in_glass(scene, max(1, PAIRS // goal.shape[1])):
+    for x, y, d in chain(*(_in_glass(one, max(1, PAIRS // goal.shape[1])) for one in scene.by_source)):
         lit = lit or len(x) > 0
         most = max(most, _largest_cosine(scene, x, y, d, goal))
         if lens.inside * most > 1.0:

@@ -74,10 +74,10 @@ def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float]) -> st
 
 
 def _image(scene: Scene) -> Spread | None:
-    """The image of the source at the middle of the screen by light through the middle of the lens; None without one, or where it is
-    wider than the screen, or images elsewhere differ much from it, as for a source right before a lens."""
+    """The image of the source at the middle of the screen by light through the middle of the lens; None without one, with several,
+    or where it is wider than the screen, or images elsewhere differ much from it, as for a source right before a lens."""
     middle, whole = source_images(scene, middle=True), source_images(scene)
-    if not middle or not whole or max(middle[0].reach()) > max(scene.screen.size):
+    if len(middle) != 1 or not whole or max(middle[0].reach()) > max(scene.screen.size):
         return None
     return middle[0] if max(whole[0].reach()) > (1.0 - SHIFTS) * max(middle[0].reach()) else None
 

@@ -34,18 +34,11 @@ from caustic_cli.scene.traits import Capability
 
 LIMITS = Capability(
     "limits by the source",
-    {
-        "separate places": "the light of separate sources has no common limit",
-        "other elements": "they may change the etendue between lens and screen",
-    },
+    {"other elements": "what stands before the screen decides which etendue it accepts"},
 )
 CONVOLUTION = Capability(
     "design by convolution with the source",
-    {
-        **dict.fromkeys(("separate places", "several sources"), "its places have images of their own"),
-        "curved screen": "the image of the source varies over the screen",
-        **dict.fromkeys(("other elements", "folded axis"), "the blur by the lens alone is not that on the screen"),
-    },
+    dict.fromkeys(("separate places", "several sources"), "its places have images of their own"),
 )
 
 #: The blur is taken as a convolution where the deviation from it is at most this fraction of its half width.
@@ -135,6 +128,7 @@ def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int
 def source_spread(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
     """The point-spread function of an extended source; None for a point source, where the blur is not well approximated by a
     convolution, where it is wider than the screen, or before several surfaces are designed."""
+    scene = scene.unfolded
     if not (scene.source.extended and CONVOLUTION.supports(scene)):
         return None
     if heights is None and scene.joint:  # the offset of one surface does not represent a lens with several
@@ -181,9 +175,9 @@ def regular_rays(
 
 
 def etendue_limit(scene: Scene) -> float | None:
-    """E_2 / E_1, at most 1; None for a source without area or of uneven radiance."""
+    """E_2 / E_1, at most 1; None for a source without area or of uneven radiance, and for several."""
     lens, screen, source = scene.lens, scene.screen, scene.source
-    if not source.even:
+    if not source.even or len(source.members) > 1:
         return None
     x, y, cell = _area(lens.half_size, lens.clear)
     area = cell * len(x)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -28,10 +29,9 @@ from caustic_cli.scene.traits import Capability
 
 SOURCE_IMAGES = Capability(
     "images of an extended source",
-    dict.fromkeys(("separate places", "several sources"), "its places have images of their own")
-    | {"ray file": "its rays have no common image"}
+    {"ray file": "its rays have no common image"}
     | dict.fromkeys(
-        ("other elements", "folded axis", "designed entrance", "gradient index"),
+        ("other elements", "designed entrance", "gradient index"),
         "one refraction behind a flat entrance does not give the image",
     ),
 )
@@ -53,11 +53,18 @@ def source_images(scene: Scene, middle: bool = False) -> list[Spread]:
     """The different images of a scene's source for light anywhere through the lens to anywhere on the screen, the sharpest first;
     middle: only that for light through the middle of the lens to the middle of the screen.
 
-    Empty without an extended source, where its positions lie at several depths or its light is that of several sources, for a ray
-    file, with other elements, a free-form entrance or a gradient index.
+    Empty without an extended source, for separate points, each of which has a sharp image, where positions lie at several depths,
+    for a ray file, with other elements, a free-form entrance or a gradient index.  Those of several sources are those of each, none
+    if one of them has none.
     """
+    scene = scene.unfolded
     source = scene.source
     if not (source.extended and SOURCE_IMAGES.supports(scene)):
+        return []
+    if len(source.members) > 1:
+        each = [source_images(one, middle) for one in scene.by_source]
+        return sorted(chain(*each), key=lambda image: max(image.reach())) if all(each) else []
+    if source.apart:
         return []
     if not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0:
         return []
@@ -93,6 +100,8 @@ def placed_images(scene: Scene, low: tuple[float, float], high: tuple[float, flo
 
     sent: where light through points of the exit lands; that to places farther from there than NEAR of the rectangle is left out.
     """
+    if len(scene.source.members) > 1:
+        return [image for one in scene.by_source for image in placed_images(one, low, high)]
     lines = [np.linspace(a, b, len(SCREEN)) for a, b in zip(low, high, strict=True)]
     matrices, (points, places) = _matrices(scene, LENS if sent is None else FINE_LENS, lines)
     if sent is not None:

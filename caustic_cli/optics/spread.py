@@ -252,7 +252,7 @@ def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | Non
 
     def landing(mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         tracer = Tracer(system, mode.through(u, v, system.object_space.index_at(None)))
-        state, left = tracer.land(parameters, scene.screen)[0].expanded(), tracer.last(parameters).state.expanded()
+        state, left = tracer.land(parameters, scene.screen)[0].expanded(), tracer.ends(parameters)[0].state.expanded()
         return *state.full(state.origin)[:2], state.power, *left.full(left.origin)[:2]
 
     return spread_of(system, landing, heights.device)
