@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers import write_blob
@@ -18,6 +20,7 @@ from caustic_cli.config import settings
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.supported import refuse
+from caustic_cli.inverse.reachability import refuse_unreachable
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
@@ -28,7 +31,7 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import lines_of, wave_image
 from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
-from caustic_cli.scene import Aperture, Disc, Lens, Light, PlaneWave, Points, Pupil, Scene, Screen
+from caustic_cli.scene import Aperture, Disc, Lens, Light, Offset, PlaneWave, Points, Pupil, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
@@ -223,3 +226,16 @@ def test_a_wave_image_names_the_wavelengths_of_all_sources():
     field = HeightField.of(scene.lens)
     z = torch.full(field.shape, 5.0, dtype=torch.float64)
     assert wave_image(scene, field, z).wavelengths == (620.0, 450.0, 500.0)
+
+
+def test_a_picture_out_of_the_reach_of_one_source_may_be_within_that_of_another():
+    """Glass of index 1.5 deflects by less than arccos(1 / 1.5) = 48.2 degrees: light along the axis does not reach a picture 60
+    degrees from it, light that arrives at 45 degrees, 28 in the glass, does."""
+    lens = Lens((10.0, 10.0), control=(8, 8), index=1.5, offset=Offset(5.0))
+    screen = Screen((10.0, 10.0), 105.0, (8, 8), shift=(100.0 * math.tan(math.radians(60.0)), 0.0))
+    axial, aslant = PlaneWave(), Points(((-100.0, 0.0, -100.0),))
+    reaches = {False: [axial, Several((axial, axial), (NONE, NONE))], True: [aslant, Several((axial, aslant), (NONE, NONE))]}
+    for reached, sources in reaches.items():
+        for source in sources:
+            with nullcontext() if reached else pytest.raises(InputError, match="deflects it by less than 48"):
+                refuse_unreachable(Scene(source, lens, screen), np.ones((8, 8)))
