@@ -98,6 +98,7 @@ LONG = (
     "test_the_commands_of_a_chapter_run[6-thesis]",
     "test_the_commands_of_a_chapter_run[17-lamp]",
     "test_draws_and_finishes_are_the_bytes_of_one_process",
+    "test_light_that_the_page_holds_lands_as_render_says[the sun",
     *(f"judged_in_scenes_of_all_kinds[{name}" for name in ("gradient", "lenslets", "separate", "several", "ray file", "far field")),
     "test_the_commands_of_a_chapter_run[13-other-elements]",
     "test_the_commands_of_a_chapter_run[16-window]",

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from helpers import write_blob
 from rayfiles import cone_of, tm25
 from test_direction import heights
@@ -25,7 +26,8 @@ from caustic_cli.io.files import is_ours
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Disc, FreeForm, Lens, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Component, Disc, FoldMirror, FreeForm, Lens, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.screen import Sags
 from caustic_cli.scene.sources.gaussian import Gaussian
 from caustic_cli.scene.sources.measured_beam import MeasuredBeam
@@ -416,3 +418,47 @@ def test_sources_of_which_one_has_no_colour_are_shown_in_grey():
     scene = Scene(source, lens, Screen((12.0, 12.0), 60.0, (24, 24)), light_of_all(tables[0] | {"also": tables[1:]}))
     assert scene.white is None and any(band.colour for band in scene.bands)
     assert all(colour is None for light in _lights(scene) for _, _, colour in light["indices"])
+
+
+#: Control points of a net of 2 x 2 lenslets like that of one.
+ARRAYED = tuple(2 * n - 1 for n in SQUARE.lens.control)
+#: Scenes whose light the page holds, each with one that differs in what makes it so.
+BEHIND = replace(SQUARE, elements=(Component(12.0, (30.0, 30.0), 6.0, (120.0, -150.0), 1.6),))
+HELD = {
+    "a lens behind": (BEHIND, SQUARE),
+    "a lens behind, source nearby": (replace(BEHIND, source=NEAR), replace(SQUARE, source=NEAR)),
+    "a lens before a mirror": (
+        replace(BEHIND, elements=(*BEHIND.elements, FoldMirror(48.0, (60.0, 60.0), tilt=(45.0, 0.0)))),
+        replace(SQUARE, elements=(FoldMirror(48.0, (60.0, 60.0), tilt=(45.0, 0.0)),)),
+    ),
+    "the sun and a lens behind": (replace(BEHIND, source=Disc(angle=3.0)), BEHIND),
+    "a gradient index": (
+        replace(SQUARE, lens=replace(SQUARE.lens, gradient=Gradient("radial", (2e-3,)))),
+        replace(SQUARE, lens=replace(SQUARE.lens, gradient=Gradient("radial", (-2e-3,)))),
+    ),
+    "round lenslets": (
+        replace(SQUARE, lens=replace(SQUARE.lens, array=(2, 2), control=ARRAYED, lenslets="round")),
+        replace(SQUARE, lens=replace(SQUARE.lens, array=(2, 2), control=ARRAYED)),
+    ),
+}
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's functions")
+@pytest.mark.parametrize("name", HELD)
+def test_light_that_the_page_holds_lands_as_render_says(name, tmp_path):
+    """On the screen, and on one that is farther away."""
+    scene, other = HELD[name]
+    field = HeightField.of(scene.lens)
+    x, y = field.control_xy()
+    z = 5.0 + 0.02 * torch.sin(0.9 * x)[:, None] * torch.cos(0.7 * y + 0.3) - 0.002 * (x[:, None] ** 2 + y**2)
+    write_page(tmp_path / "page.html", scene, field, z)
+    assert (tmp_path / "page.html").stat().st_size < MOST
+    rays = 1_600_000 if scene.source.half_angle else 400_000
+    for farther in (0.0, 20.0):
+        there = replace(scene, screen=replace(scene.screen, z=scene.screen.z + farther))
+        wanted = expose(there, field, z, rays_of(there, "stratified", rays)).image.numpy()
+        found = by_node(tmp_path / "page.html", there.screen.z)
+        assert wanted.sum() > 0.2 and found.sum() == pytest.approx(wanted.sum(), rel=0.01)
+        assert relative_rms(found, wanted) < ALIKE
+    wrong = expose(other, field, z, rays_of(other, "stratified", 400_000)).image.numpy()
+    assert relative_rms(wrong, wanted) > 2 * ALIKE

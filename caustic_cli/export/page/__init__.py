@@ -3,7 +3,8 @@ screen.
 
 The page holds heights and slopes of the free-form surfaces, and of a curved screen over its tangent plane, on regular grids, and
 traces rays in the browser, offline.  Values are quantised to 16 bits between the least and the largest: one quantum of a slope
-displaces light by 1/65,535 of the range of all slopes, far less than a pixel.
+displaces light by 1/65,535 of the range of all slopes, far less than a pixel.  Light that has more before its screen than one lens
+of one index is held as rays (`traced`): the screen moves on such a page, the light does not.
 
 Notation
     c[i, j]     codes, i along +x and j along +y; stored as their differences along both axes, modulo 2^16, for compression
@@ -29,6 +30,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.export.page.traced import ITSELF, traced_lights
 from caustic_cli.export.surface import SurfaceGrid, sample_grid
 from caustic_cli.io.colorimetry import rgb_matrix
 from caustic_cli.io.files import CREATED_BY, write_bytes
@@ -42,6 +44,8 @@ from caustic_cli.scene.traits import Capability
 
 #: Cells of the grid along its longer side, the finest that fits is used; multiples of COARSEST, by which the page subsamples it.
 CELLS = (1024, 768, 512, 384)
+#: The same of light that is held as rays (`traced`), of which each point of the source has a grid.
+FEWER = (512, 384, 256, 192, 128, 96, 64, 32)
 COARSEST = 32
 #: Largest size of the page, bytes, for e-mail, and of the grid in it.
 MOST, MOST_CLOUD = 5_000_000, 3_400_000
@@ -83,10 +87,6 @@ FILE = (
 PAGE = Capability(
     "interactive page",
     {
-        "gradient index": "⟨html⟩: the page traces lenses of one index, and this one's varies",
-        "other elements": "⟨html⟩: the page traces a single lens, and this scene has [[element]] tables",
-        "round lenslets": "⟨html⟩: the page traces all light that meets the surface, and round lenslets have an opaque mask between"
-        " them",
         "ray file": FILE,
         "ray file among sources": FILE,
     },
@@ -122,12 +122,13 @@ def write_page(
     """
     PAGE.refuse(scene)
     scene = scene.unfolded
+    moves = ITSELF.supports(scene)
     screen, kind = _coarser(scene.screen), scene.lens.kind
     data = {
         "title": title,
         "lens": _lens(scene.lens),
         "screen": _screen(replace(scene, screen=screen)),
-        "lights": _lights(scene),
+        "lights": _lights(scene) if moves else [],
         "encoding": encoding,
         "target": None if target is None else _coded(_onto(target, screen)),
         "waves": None if waves is None else _coded(_onto(waves, screen)),
@@ -141,9 +142,12 @@ def write_page(
         "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes),
     }
     fronts = sum(_length(light["front"]) for light in data["lights"] if light.get("front"))
-    for cells in CELLS:
+    for cells in CELLS if moves else FEWER:
         cloud = _cloud(scene, field, heights, cells)
-        if _length(cloud) + fronts <= MOST_CLOUD or cells == CELLS[-1]:
+        if not moves:
+            data["lights"] = [_held(scene, field, heights, tuple(cloud["exit"]["z"]["shape"]))]
+            fronts = sum(map(_length, data["lights"][0]["rays"]))
+        if _length(cloud) + fronts <= MOST_CLOUD:
             break
     page = _assembled(words, data | {"cloud": cloud}).encode()
     assert len(page) <= MOST, len(page)
@@ -228,7 +232,7 @@ def _surface(z: np.ndarray, zx: np.ndarray, zy: np.ndarray) -> dict:
 
 def _length(held: dict) -> int:
     """Bytes of all grids in nested parts of the page's data."""
-    return len(held["data"]) if "data" in held else sum(_length(part) for part in held.values() if part)
+    return len(held["data"]) if "data" in held else sum(_length(part) for part in held.values() if isinstance(part, dict))
 
 
 def _front(source: Source, pupil: Pupil, points: int) -> dict | None:
@@ -296,6 +300,26 @@ def _lights(scene: Scene) -> list[dict]:
             }
         )
     return lights
+
+
+def _held(scene: Scene, field: HeightField, heights: Tensor, counts: tuple[int, int]) -> dict:
+    """All light as rays behind the last surface, see `traced`, as a source that the page takes to its screen."""
+    pupil, lens = scene.pupil.half_size, scene.lens.half_size
+    more = math.prod(pupil) / math.prod(lens)  # power per area of the lens' rectangle, over which the page has the grid
+    rays = []
+    for one in traced_lights(scene, field, heights, counts):
+        colour = one.band.colour
+        rays.append(
+            {
+                "part": one.part * more,
+                "z": one.z,
+                "ahead": one.ahead,
+                "colour": None if colour is None or scene.white is None else _primaries(scene, np.array(colour)).tolist(),
+                **{name: _coded(grid) for name, grid in one.grids.items()},
+            }
+        )
+    still = {"near": False, "places": [[0.0, 0.0, 0.0, 1.0]], "extent": [0.0, 0.0], "axis": [0.0, 0.0, 1.0], "indices": []}
+    return {"weight": 1.0, **still, "rays": rays}
 
 
 def _source(scene: Scene, source: Source, points: int) -> dict:

@@ -61,7 +61,10 @@ async function unpacked() {
   const { exit, entrance } = held.cloud, reach = held.lens.size.map((s) => s / 2);
   const cloud = { ...(await gridOf(exit, reach)), entrance: await gridOf(entrance, reach) };
   cloud.shape = await gridOf(held.screen.shape, held.screen.low.map(Math.abs));
-  for (const light of held.lights) light.grid = await gridOf(light.front, reach);
+  for (const light of held.lights) {
+    light.grid = await gridOf(light.front, reach);
+    for (const rays of light.rays || []) for (const name of ["x", "y", "ox", "oy", "w"]) rays[name] = await decoded(rays[name]);
+  }
   const target = held.target && (await decoded(held.target)), waves = held.waves && (await decoded(held.waves));
   const wavesColour = held.wavesColour && (await Promise.all(held.wavesColour.map(decoded)));
   return { cloud, target, waves, wavesColour };
@@ -117,6 +120,7 @@ function beamsOf(setting, most = MOST_BEAMS) {
   const rows = leaning(setting.leanX, setting.leanY), beams = [];
   const area = held.lens.size[0] * held.lens.size[1] * (held.lens.round ? Math.PI / 4 : 1), { pixel } = held.screen;
   for (const light of held.lights) {
+    for (const rays of light.rays || []) beams.push({ rays, power: rays.part, light, colour: rays.colour });
     const extent = extentOf(light, setting.size), places = light.places.length;
     const far = Math.abs(setting.z - held.lens.zIn) / (light.near ? 1 : light.axis[2]);
     const blur = Math.max(...extent.map((e, k) => ((2 * e) / pixel[k]) * (light.near ? far / Math.abs(light.places[0][2]) : far)));
@@ -138,8 +142,9 @@ function beamsOf(setting, most = MOST_BEAMS) {
   return beams;
 }
 
-/** By how much the grid is thinned out: many beams make a smooth image, of which coarser cells are enough. */
-const thinning = (beams) => (beams <= 4 ? 1 : beams <= 48 ? 2 : 4);
+/** By how much the grid is thinned out: many beams make a smooth image, of which coarser cells are enough; rays that the page holds
+ * have them already. */
+const thinning = (beams) => (beams <= 4 || held.lights[0].rays ? 1 : beams <= 48 ? 2 : 4);
 
 // ---- tracing on the processor
 
@@ -267,8 +272,17 @@ function screenAt(cloud, z) {
 function rowTracer(cloud, z, thin) {
   const { lens } = held, { fresnel } = lens, { ny } = cloud, [rx, ry] = lens.size.map((s) => s / 2);
   const enter = entranceOf(cloud), meet = screenAt(cloud, z), ray = {};
+  /** The corners of a row of light that the page holds behind the last surface. */
+  const takeRow = ({ rays, power }, i, x, row) => {
+    for (let j = 0, b = 0; j < ny; j += thin, b++) {
+      const k = i * ny + j, ox = rays.ox[k], oy = rays.oy[k];
+      meet(rays.x[k], rays.y[k], rays.z, ox, oy, rays.ahead * Math.sqrt(1 - ox * ox - oy * oy), row, b);
+      row.ex[b] = row.qx[b] = x; row.ey[b] = row.qy[b] = (2 * j / (ny - 1) - 1) * ry; row.w[b] = rays.w[k] * power;
+    }
+  };
   return (beam, i, row) => {
     const x = (2 * i / (cloud.nx - 1) - 1) * rx, { n } = beam;
+    if (beam.rays) { takeRow(beam, i, x, row); return; }
     for (let j = 0, b = 0; j < ny; j += thin, b++) {
       const k = i * ny + j, y = (2 * j / (ny - 1) - 1) * ry, zx = cloud.zx[k], zy = cloud.zy[k], height = cloud.z[k];
       enter(beam, x, y, height, ray);
@@ -720,17 +734,17 @@ function solidView(canvas, cloud) {
 
 /** What the screen's place, the light's lean and the source's size are where the lens was designed, and how far each may go. */
 function ranges() {
-  const { screen, lights } = held, first = lights[0], sign = screen.z < 0 ? -1 : 1;
+  const { screen, lights } = held, first = lights[0], still = Boolean(first.rays), sign = screen.z < 0 ? -1 : 1;
   const far = Math.abs(screen.z - held.lens.zIn), across = Math.max(...screen.resolution.map((m, k) => m * screen.pixel[k]));
   const own = 2 * Math.max(...first.extent), at = first.near ? Math.abs(first.places[0][2]) : 1;
   const size = first.near ? own : (2 * Math.asin(own / 2) * 180) / Math.PI;
   const wide = ((0.15 * across) / far) * (first.near ? at : 180 / Math.PI); // blurs 15 % of the screen
   return {
     sign,
-    throw: screen.focal ? null : { value: sign * screen.z, min: 0.3 * sign * screen.z, max: 2 * sign * screen.z, unit: "mm" },
-    leanx: { value: 0, min: -15, max: 15, unit: "°" },
-    leany: { value: 0, min: -15, max: 15, unit: "°" },
-    size: { value: size, min: 0, max: Math.max(2 * size, wide), unit: first.near ? "mm" : "°" },
+    throw: screen.focal ? null : { value: sign * screen.z, min: Math.max(0.3 * sign * screen.z, still ? sign * first.rays[0].z + 1 : 0), max: 2 * sign * screen.z, unit: "mm" },
+    leanx: still ? null : { value: 0, min: -15, max: 15, unit: "°" },
+    leany: still ? null : { value: 0, min: -15, max: 15, unit: "°" },
+    size: still ? null : { value: size, min: 0, max: Math.max(2 * size, wide), unit: first.near ? "mm" : "°" },
   };
 }
 
@@ -741,11 +755,11 @@ async function start() {
   const { cloud, target, waves, wavesColour } = await unpacked(), range = ranges(), asked = new URLSearchParams(location.hash.slice(1));
   const names = ["throw", "leanx", "leany", "size"].filter((name) => range[name]), touched = new Set();
   const areas = areasOf(cloud.shape), dense = (light) => (areas ? Float64Array.from(light, (v, k) => v / areas[k]) : light); // irradiance
-  byId("throw-control").hidden = !range.throw;
+  for (const name of ["throw", "leanx", "leany", "size"]) byId(`${name}-control`).hidden = !range[name];
   solidView(byId("solid"), cloud);
   byId("scale").textContent = `${held.screen.resolution.map((m, k) => tidy(m * held.screen.pixel[k], 4)).join(" × ")} ${held.screen.unit}, ${held.screen.resolution.join(" × ")} pixels.`;
   byId("size-name").textContent = held.lights[0].near ? "Size of the source" : "Angular size of the source";
-  byId("size-unit").textContent = range.size.unit;
+  byId("size-unit").textContent = range.size ? range.size.unit : "";
   const aim = target && dense(target), brightest = (light) => (target ? (most(aim) / sum(target)) * sum(light) : most(dense(light)));
   if (target) paintLight(byId("target"), aim, most(aim));
   for (const id of target ? [] : ["target-figure", "difference-figure", "rms-row"]) byId(id).hidden = true;
@@ -755,7 +769,7 @@ async function start() {
 
   let graphics = null;
   const wanted = asked.get("engine");
-  if (wanted !== "cpu") {
+  if (wanted !== "cpu" && !held.lights[0].rays) {
     try { graphics = graphicsTracer(cloud, wanted === "gpu"); } catch (error) { graphics = null; }
   }
   byId("gpu-choice").hidden = !graphics;
@@ -793,7 +807,7 @@ async function start() {
 
   /** What the controls say; what was not touched is exactly as designed. */
   const setting = () => {
-    const read = (name) => (touched.has(name) ? Number(byId(`${name}-number`).value) : range[name].value);
+    const read = (name) => (!range[name] ? 0 : touched.has(name) ? Number(byId(`${name}-number`).value) : range[name].value);
     return { z: range.throw ? range.sign * read("throw") : held.screen.z, leanX: read("leanx"), leanY: read("leany"), size: touched.has("size") ? read("size") : null };
   };
 
