@@ -23,10 +23,6 @@ class AmongElements(OneSurface):
     def applies(cls, s: Settings) -> bool:
         return bool(s.elements)
 
-    @classmethod
-    def spread(cls, d: Defaults) -> bool:
-        return False
-
     def _bounds(self, k: int) -> tuple[Tensor, Tensor]:
         low, high = super()._bounds(k)
         ahead = [e.extent[0] for e in self.scene.behind[:1]]
