@@ -424,6 +424,7 @@ def test_sources_of_which_one_has_no_colour_are_shown_in_grey():
 ARRAYED = tuple(2 * n - 1 for n in SQUARE.lens.control)
 #: Scenes whose light the page holds, each with one that differs in what makes it so.
 BEHIND = replace(SQUARE, elements=(Component(12.0, (30.0, 30.0), 6.0, (120.0, -150.0), 1.6),))
+WEAK = replace(SQUARE, elements=(Component(12.0, (30.0, 30.0), 6.0, (900.0, -900.0), 1.6),))
 HELD = {
     "a lens behind": (BEHIND, SQUARE),
     "a lens behind, source nearby": (replace(BEHIND, source=NEAR), replace(SQUARE, source=NEAR)),
@@ -431,7 +432,7 @@ HELD = {
         replace(BEHIND, elements=(*BEHIND.elements, FoldMirror(48.0, (60.0, 60.0), tilt=(45.0, 0.0)))),
         replace(SQUARE, elements=(FoldMirror(48.0, (60.0, 60.0), tilt=(45.0, 0.0)),)),
     ),
-    "the sun and a lens behind": (replace(BEHIND, source=Disc(angle=3.0)), BEHIND),
+    "the sun and a lens behind": (replace(WEAK, source=Disc(angle=3.0)), replace(SQUARE, source=Disc(angle=9.0))),
     "a gradient index": (
         replace(SQUARE, lens=replace(SQUARE.lens, gradient=Gradient("radial", (2e-3,)))),
         replace(SQUARE, lens=replace(SQUARE.lens, gradient=Gradient("radial", (-2e-3,)))),
