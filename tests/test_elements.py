@@ -623,7 +623,7 @@ def test_design_render_resume_and_files(_here, capfd):
     (z, zx, zy), report = lens.surface(*np.meshgrid(*[np.linspace(-5, 5, 101)] * 2, indexing="ij")), found["report"]
     assert report["minimum_wall_mm"] == pytest.approx(z.min() - lens.scene.lens.z_in, rel=1e-3)
     assert report["maximum_slope"] == pytest.approx(np.hypot(zx, zy).max(), rel=0.02) and report["sharpness_limit_mm"] is None
-    run(capfd, "render", "p", "--html", "page.html", "--quiet", "--force")
+    run(capfd, "render", "p", "--html", "page.html", "--rays", "20000", "--quiet", "--force", "--json")
     assert '"rays":[{' in Path("page.html").read_text()
     run(capfd, "export", "p", "--format", "zemax", "--samples", "33", "--json", "--quiet")
     assert "among other elements" in Path("p.dat").read_text()
