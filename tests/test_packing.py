@@ -51,6 +51,39 @@ def test_a_rounded_net_is_off_by_half_a_step():
     assert rounded(small) is small
 
 
+def planes(net: np.ndarray) -> bytes:
+    """Packed by the format of version 2, written out from its description: byte planes of differences in two's complement."""
+    steps = (net / STEP).astype("<i8")
+    across = np.concatenate([steps[:, :1], steps[:, 1:] - steps[:, :-1]], 1)
+    both = np.concatenate([across[:1], across[1:] - across[:-1]])
+    return zlib.compress(both.reshape(-1, 1).view(np.uint8).T.tobytes(), 1)
+
+
+def test_signs_in_the_lowest_bit_take_less_than_half_of_a_complement():
+    net = net_of(SHAPES[0])
+    packed = pack(net)
+    assert packed is not None and len(packed) < 0.6 * len(planes(net))
+    extreme = np.zeros(SHAPES[0])
+    extreme[::3, ::2], extreme[1::3, 1::2] = (2.0**50 - 1.0) * STEP, (1.0 - 2.0**50) * STEP
+    assert (unpack(pack(extreme), extreme.shape) == extreme).all()
+
+
+def test_a_checkpoint_of_version_2_is_read(saved):
+    path, made = saved
+    image = io.BytesIO(path.read_bytes()[512:])
+    nets = {"lens/heights": made.state.heights, "start": made.state.start - made.state.heights}
+    with h5py.File(image, "r+") as f:
+        f.attrs["format_version"] = 2
+        del f["unrounded"]
+        for name, net in nets.items():
+            del f[name]
+            f[name] = np.frombuffer(planes(net.numpy()), np.uint8)
+            f[name].attrs["shape"] = net.shape
+    path.write_bytes(seal(image.getvalue()) + image.getvalue())
+    back = load(path).state
+    assert torch.equal(back.heights, made.state.heights) and torch.equal(back.start, made.state.start)
+
+
 @pytest.mark.parametrize("kind", ["small", "no whole steps", "large values", "not finite", "beside one of no whole steps"])
 def test_what_cannot_come_back_is_not_packed(kind):
     net, like = net_of(SHAPES[0]), None

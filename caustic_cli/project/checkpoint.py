@@ -10,7 +10,7 @@
     /state/parameters/*, /state/optimizer/*   tensors by name
     /history                  (iterations, 5): iteration, stage, loss (eq. 5.2.1), on_screen, seconds
     /accuracy                 (rows, 4): iteration, seconds, processor seconds, error by independent light
-    attributes                format_version (2 with packed nets, else 1), created_by, provenance, results, inputs (JSON)
+    attributes                format_version (1; with packed nets 3, earlier 2), created_by, provenance, results, inputs (JSON)
 
 A file whose writer was killed cannot be read, so a checkpoint is never updated in place: it is written to a temporary file and
 renamed.  The HDF5 data follow a user block of SEAL bytes with the sha256 of the data, so that no part of a damaged file is used.
@@ -44,7 +44,9 @@ from caustic_cli.io.files import open_regular, write_bytes
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.project.packing import pack, unpack
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+#: Version without packed nets, and that whose packed nets are differences in two's complement.
+PLAIN, COMPLEMENT = 1, 2
 HEIGHTS = "lens/heights"
 #: Nets that a state may have beside its heights.
 STARTS = ("start", "unrounded")
@@ -91,7 +93,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     state, spaces = checkpoint.state, checkpoint.spaces
     image = io.BytesIO()  # in memory, so that a full disk is not an error inside HDF5
     with h5py.File(image, "w") as f:
-        f.attrs["format_version"] = FORMAT_VERSION - 1
+        f.attrs["format_version"] = PLAIN
         f.attrs["created_by"] = f"caustic {__version__}"
         f.attrs["provenance"] = json.dumps(checkpoint.provenance, sort_keys=True)
         f.attrs["results"] = json.dumps(checkpoint.results)
@@ -201,7 +203,8 @@ class _Contents:
         if values.dtype != np.uint8 or min(shape) < 1 or math.prod(shape) > MOST_PACKED:
             raise ValueError(f"shape of {name}")
         like = None if beside is None or beside.shape != shape else beside.numpy()
-        return torch.from_numpy(unpack(values.tobytes(), shape, like))
+        complement = int(self.file.attrs["format_version"]) <= COMPLEMENT
+        return torch.from_numpy(unpack(values.tobytes(), shape, like, complement))
 
 
 def load(path: Path) -> Checkpoint:

@@ -1,7 +1,9 @@
 """Compression of large control nets: fixed-point heights in units of STEP, delta coding along both axes, deflate.
 
 Over a knot span of 5 um the mixed second difference of a surface is a few nanometres, except at creases: in units of STEP these are
-small integers, and zlib compresses a net of 2000 x 2000 to 8 MB instead of 32 in float64.  Decoding by integer sums is exact.
+small integers.  With the sign as the lowest bit (0, -1, 1, -2, ... become 0, 1, 2, 3, ...), the upper bytes of most are 0, where
+those of a two's complement change with the sign: zlib compresses a net of 3000 x 3000 to 6 MB instead of 72 in float64 (17 without
+that).  Decoding by integer sums is exact.
 
 Rounding to STEP changes a height by at most 2 pm: with spans of 5 um, a ray by 0.04 um at 300 mm.
 """
@@ -18,10 +20,12 @@ from torch import Tensor
 STEP = 2.0**-28
 #: Least number of values of a net that is compressed.
 LARGE = 1 << 20
-#: Typical bytes per compressed height: text and lines on nets of 2000 x 2000.
-PACKED = 2.0
-#: Largest multiple of STEP that is compressed: sums of four are within int64, and each is exact in float64.
+#: Typical bytes per compressed height, of a net and of its difference to another: the flame, by one lens and by an array.
+PACKED = 0.65
+#: Largest multiple of STEP that is compressed: twice the sum of four is within int64, and each is exact in float64.
 MOST = 2.0**50
+#: Bits of an int64 but for its sign.
+SIGN = 63
 
 
 def rounded(net: Tensor) -> Tensor:
@@ -44,6 +48,7 @@ def pack(net: np.ndarray, like: np.ndarray | None = None) -> bytes | None:
         values -= (like / STEP).astype(np.int64)
     for axis in (-1, -2):
         values = np.diff(values, axis=axis, prepend=0)
+    values = (values << 1) ^ (values >> SIGN)
     # In byte planes, so that similar bytes are adjacent; run-length matching alone is six times as fast as the default strategy.
     planes = np.ascontiguousarray(values.astype("<i8").reshape(-1, 1).view(np.uint8).T)
     packer = zlib.compressobj(strategy=zlib.Z_RLE)
@@ -55,8 +60,8 @@ def _whole(net: np.ndarray) -> bool:
     return bool((np.abs(steps) < MOST).all() and (steps == np.round(steps)).all())
 
 
-def unpack(data: bytes, shape: tuple[int, ...], like: np.ndarray | None = None) -> np.ndarray:
-    """Decompress a net of this shape, with the same `like`.
+def unpack(data: bytes, shape: tuple[int, ...], like: np.ndarray | None = None, complement: bool = False) -> np.ndarray:
+    """Decompress a net of this shape, with the same `like`; complement: of a version with differences in two's complement.
 
     Raises:
         ValueError: the data are invalid.
@@ -70,6 +75,8 @@ def unpack(data: bytes, shape: tuple[int, ...], like: np.ndarray | None = None) 
     if len(found) != count or (like is not None and like.shape != shape):
         raise ValueError("size of a packed net")
     values = np.ascontiguousarray(np.frombuffer(found, np.uint8).reshape(8, -1).T).view("<i8").reshape(shape)
+    if not complement:
+        values = ((values >> 1) & ((1 << SIGN) - 1)) ^ -(values & 1)
     for axis in (-2, -1):
         values = np.cumsum(values, axis=axis)
     net = values * STEP
