@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import write_blob
 from scipy.interpolate import BSpline
+from scipy.optimize import linear_sum_assignment
 
 import caustic_cli as caustic
 from caustic_cli import cli
@@ -71,6 +72,38 @@ def test_cells_fill_the_array(packing, array, size):
         assert abs(x) + cells.radius <= size[0] / 2 + 1e-12 and abs(y) + cells.radius <= size[1] / 2 + 1e-12
     apart = [math.dist(a, b) for k, a in enumerate(cells.centres) for b in cells.centres[:k]]
     assert min(apart, default=math.inf) >= 2 * cells.radius * (1 - 1e-12)
+
+
+@pytest.mark.parametrize(("array", "size"), [*SIZES, ((6, 6), (10.0, 10.0))])
+def test_cells_of_equal_area(array, size):
+    cells, half = cells_of("hexagonal", array, size, equal=True), (size[0] / 2, size[1] / 2)
+    outlines = [ConvexAperture(half, cells.outline(k)) for k in range(math.prod(array))]
+    np.testing.assert_allclose([one.area for one in outlines], math.prod(size) / math.prod(array), rtol=1e-9)
+    at = (np.random.default_rng(4).random((2, 20_000)) - 0.5) * np.array(size)[:, None]
+    number = cells.number(*at)
+    assert (cells.number(*map(torch.from_numpy, at)).numpy() == number).all()
+    for k, one in enumerate(outlines):
+        assert (one.contains(*at) == (number == k)).all()
+
+
+@pytest.mark.parametrize(("array", "size"), [((3, 3), (10.0, 10.0)), ((4, 3), (9.0, 7.0))])
+def test_they_are_the_assignment_of_least_cost(array, size):
+    """Points to centres, equally many to each, by the sum of squares of the distances (linear programming)."""
+    cells, each = cells_of("hexagonal", array, size, equal=True), 100
+    lines = [(np.arange(n) + 0.5) * w / n - 0.5 * w for n, w in zip((10 * array[0], 10 * array[1]), size, strict=True)]
+    x, y = (c.ravel() for c in np.meshgrid(*lines, indexing="ij"))
+    centres = np.repeat(np.array(cells.centres), each, 0)
+    points, places = linear_sum_assignment((x[:, None] - centres[:, 0]) ** 2 + (y[:, None] - centres[:, 1]) ** 2)
+    same = cells.number(x, y)[points] == places // each
+    assert same.mean() > 0.97  # but for points on borders; of the nearest centres 0.79 and 0.85
+    near = cells_of("hexagonal", array, size).number(x, y)
+    assert (near[points] == places // each).mean() < 0.9
+
+
+@pytest.mark.parametrize("lenslets_", ["filled", "round"])
+def test_light_of_hexagonal_lenslets_is_equal(lenslets_):
+    parts = lenslets(hexagonal((3, 3), (9.0, 9.0), lenslets=lenslets_))
+    assert [one.share for one in parts] == pytest.approx([1.0 / 9.0] * 9, rel=0.02)  # by subsamples of cells
 
 
 def test_cells_inside_are_regular_hexagons():

@@ -266,13 +266,13 @@ def assemble(nets: Sequence[Tensor], array: tuple[int, int]) -> AssembledArray:
 def sampled(parts: Sequence[Lenslet], nets: Sequence[Tensor], lens: Lens, field: HeightField) -> AssembledArray:
     """The array whose control points are those of the lenslets with these nets, each of the lenslet at its place; `gap` is between
     the lenslets of neighbouring control points, at the first of them."""
-    at = [c.contiguous() for c in torch.meshgrid(*field.control_xy(), indexing="ij")]
-    owner = lens.cells.number(*at).long()
+    at_x, at_y = field.control_xy()
+    owner = lens.cells.number(at_x[:, None], at_y[None, :]).long()
     net, borders = torch.zeros(owner.shape, dtype=torch.float64), []
     for axis in (0, 1):
         here, there = owner.narrow(axis, 0, owner.shape[axis] - 1), owner.narrow(axis, 1, owner.shape[axis] - 1)
         i, j = (here != there).nonzero().T
-        borders.append((here[i, j], there[i, j], at[0][i, j], at[1][i, j]))
+        borders.append((here[i, j], there[i, j], at_x[i], at_y[j]))
     one, two, x, y = (torch.cat(c) for c in zip(*borders, strict=True))
 
     def height(k: int, x: Tensor, y: Tensor) -> Tensor:

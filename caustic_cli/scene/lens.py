@@ -26,7 +26,7 @@ from caustic_cli.schema import checks
 from caustic_cli.schema.table import TABLE, check, check_all, default
 
 if TYPE_CHECKING:
-    from caustic_cli.scene.packing import Cells
+    from caustic_cli.scene.cells import Cells
 
 packings = OnDemand("caustic_cli.scene.packing")
 
@@ -237,7 +237,7 @@ class Lens:
     @cached_property
     def cells(self) -> Cells:
         """Where the lenslets of an array are."""
-        return packings.cells_of(self.packing, self.array, self.size)
+        return packings.cells_of(self.packing, self.array, self.size, equal=not self.round_lenslets)
 
     @property
     def pieces(self) -> tuple[int, int]:

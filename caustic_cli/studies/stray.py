@@ -15,7 +15,7 @@ from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
-from caustic_cli.scene.packing import Cells
+from caustic_cli.scene.cells import Cells
 from caustic_cli.studies.retrace import sampler_for
 
 
