@@ -37,6 +37,7 @@ SLOW = (
     "stability",
     "waves",
     "test_aperture.py",
+    "test_array_beam.py",
     "test_batch.py",
     "test_cli.py",
     "test_convergence.py",

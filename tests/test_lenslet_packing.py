@@ -235,6 +235,22 @@ def test_lenslets_have_the_spans_per_pixel_of_one_lens(packing, gaps):
         assert list(stage.control) == list(full.lens.control) and stage.rays >= math.prod(full.lens.control)
 
 
+@pytest.mark.parametrize("packing", ["square", "hexagonal"])
+@pytest.mark.parametrize(
+    "more",
+    [{"source": {"type": "plane", "angle": 0.05}}, {"design": {"waves": "on"}}],
+    ids=["disc at infinity", "waves"],
+)
+def test_so_have_lenslets_without_creases(packing, more):
+    """Where blur or diffraction smooth creases, so that one lens has a coarse net."""
+    for array in ((2, 2), (3, 2)):
+        sections = {"screen": {"resolution": [60, 60]}, **more}
+        one = complete(sections, 1.0)
+        full = complete({**sections, "lens": {"array": list(array), "packing": packing}}, 1.0)
+        for n, m, k in zip(full.lens.control, one.lens.control, array, strict=True):
+            assert n - 3 >= k * (m - 3)
+
+
 # The program
 
 

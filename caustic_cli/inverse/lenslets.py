@@ -47,7 +47,6 @@ from caustic_cli.scene.traits import Capability
 LENSLETS = Capability(
     "lenslet arrays",
     {
-        "laser beam": "⟨lens.array⟩ would give each lenslet a beam of its own",
         **dict.fromkeys(
             ("ray file", "ray file among sources"), "⟨lens.array⟩ does not divide the rays of a file among its lenslets"
         ),
@@ -188,7 +187,7 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
             outline=_outline(lens, k, (w / 2.0, h / 2.0), (mx, my)),
         )
         source = scene.source.members[k] if scene.source.by_lenslet else scene.source
-        alone = source.each(lambda light, ends=ends, middle=(mx, my): _part(light, ends, middle))
+        alone = source.each(lambda light, ends=ends, middle=(mx, my): _part(light.on(scene.pupil), ends, middle))
         screen = scene.screen
         if not screen.far:
             screen = replace(screen, shift=(screen.shift[0] - mx, screen.shift[1] - my))
@@ -203,8 +202,9 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
 
 
 def _part(source: Source, ends: Sequence[tuple[float, float]], middle: Sequence[float]) -> Source:
-    """A source in the frame of a lenslet: a near one displaced, of a distant one its profile over the rectangle between `ends`."""
-    if source.profile is None:
+    """A source in the frame of a lenslet: a near one or a beam displaced, of a plane wave its profile over the rectangle between
+    `ends`."""
+    if source.profile is None or source.beam is not None:
         return source.displaced(lambda at: (at[0] - middle[0], at[1] - middle[1], at[2]), 1.0)
     profile, across = source.profile, []
     for (low, high), n in zip(ends, source.profile.shape, strict=True):
@@ -217,7 +217,9 @@ def _light_on(scene: Scene, source: Source, lens: Lens, section: Source, middle:
     """Light of a source on a lenslet, the lens in its own frame, with its section of the source there, in the same unit for all of
     an array."""
     x, y = (np.linspace(-r, r, CELLS + 1) for r in lens.half_size)
-    if not source.distant:
+    if section.beam is not None:
+        light = section.irradiance(0.5 * (x[1:] + x[:-1])[:, None], 0.5 * (y[1:] + y[:-1])[None, :], lens.pupil)
+    elif not source.distant:
         light = on_entrance(replace(scene, source=source), x + middle[0], y + middle[1])[0]
     else:
         light = np.ones((CELLS, CELLS)) if section.profile is None else resampled(section.profile, (CELLS, CELLS))

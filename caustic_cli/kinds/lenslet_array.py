@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -70,6 +70,12 @@ class LensletArray(OneSurface):
         d.set_control(fits)
 
     @classmethod
+    def default_control(cls, d: Defaults) -> list[int]:
+        """For each lenslet that of one lens; with a source each the noise of its few rays would be fitted by so many points."""
+        found = super().default_control(d)
+        return found if cls.by_lenslets(d) else [k * (n - 1) + 1 for n, k in zip(found, d.lens.array, strict=True)]
+
+    @classmethod
     def fitting(cls, d: Defaults) -> list[int]:
         """The control net next to that set so far that lenslets share."""
         pieces = cls.pieces(d)
@@ -110,6 +116,17 @@ class LensletArray(OneSurface):
         if cls.by_lenslets(d):
             stages = each_lenslet(stages, d.lens.array, d.resolution)
         return stages
+
+    def notes(self, size: tuple[float, float], timed: bool, without_waves: str) -> Iterator[str]:
+        yield from super().notes(size, timed, without_waves)
+        lens, screen, source = self.scene.lens, self.scene.screen, self.scene.source
+        if source.beam is not None and not source.extended:
+            distance, pitch = abs(screen.z - lens.offset.thickness), min(lens.cells.pitch)
+            fringes = 1e-6 * self.scene.light.mean * distance / pitch
+            yield (
+                f"the light of lenslets side by side interferes, in fringes of {fringes:.2g} {screen.unit}, pixels being"
+                f" {max(screen.pixel):.2g}: a design by rays is that of their mean, which light of a shorter coherence shows"
+            )
 
     def takes_lenslets(self, k: int) -> bool:
         return not (self.stages[k].waves or self.stages[k].spread)

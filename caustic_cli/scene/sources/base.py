@@ -221,6 +221,10 @@ class Source:
         """Whether it has a size."""
         return False
 
+    def on(self, pupil: Pupil) -> Source:
+        """The source whose light does not depend on the pupil that it is given, as if that were always this one."""
+        return self
+
     def each(self, change: Callable[[Source], Source]) -> Source:
         """The source with each of its members changed."""
         return change(self)

@@ -12,7 +12,7 @@ V is a bicubic spline through the phase at the centres of its cells, and the irr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -44,6 +44,7 @@ class MeasuredBeam(Source):
         profile: relative irradiance over the aperture, (c, d), None for an even one.
         power: through the aperture, W.
         aside: decentre, mm.
+        over: half widths of what it was measured over, mm; None for those of the pupil.
 
     Raises:
         InputError: one is out of range, or the phase is wrapped.
@@ -54,6 +55,7 @@ class MeasuredBeam(Source):
     profile: np.ndarray | None = None
     power: float = 1.0
     aside: tuple[float, float] = (0.0, 0.0)
+    over: tuple[float, float] | None = None
 
     kind = "measured"
     distant = True
@@ -84,7 +86,14 @@ class MeasuredBeam(Source):
     def displaced(self, place, scale: float, axis=None) -> Source:
         """The beam decentred."""
         x, y, _ = place((*self.aside, 0.0))
-        return MeasuredBeam(self.phase, self.wavelength, self.profile, self.power, (x, y))
+        return replace(self, aside=(x, y))
+
+    def on(self, pupil: Pupil) -> Source:
+        """As of a source."""
+        return replace(self, over=self._half_size(pupil))
+
+    def _half_size(self, pupil: Pupil) -> tuple[float, float]:
+        return self.over or pupil.half_size
 
     def incidence(self, pupil: Pupil) -> float:
         """As of a source."""
@@ -95,7 +104,7 @@ class MeasuredBeam(Source):
         return min(math.asin(min(1.0, 2.0 * sine)), math.pi / 2.0)
 
     def _each(self, pupil: Pupil):
-        return zip((0, 1), self.phase.shape, pupil.half_size, strict=True)
+        return zip((0, 1), self.phase.shape, self._half_size(pupil), strict=True)
 
     @cached_property
     def _path(self) -> _Cubic:
@@ -105,14 +114,14 @@ class MeasuredBeam(Source):
     def _places(self, x, y, pupil: Pupil) -> tuple[np.ndarray, np.ndarray]:
         """Points of the pupil's plane, mm, over [-1, 1]^2 of the beam, in arrays of one shape."""
         a, b = (np.asarray(c if isinstance(c, np.ndarray | float) else c.detach().cpu(), dtype=np.float64) for c in (x, y))
-        a, b = ((c - s) / h for c, s, h in zip((a, b), self.aside, pupil.half_size, strict=True))
+        a, b = ((c - s) / h for c, s, h in zip((a, b), self.aside, self._half_size(pupil), strict=True))
         u, v = np.broadcast_arrays(a, b)
         return u, v
 
     def beam(self, x, y, pupil: Pupil, across=0.0, along=0.0) -> Field:
         """As of `gaussian.Gaussian.beam`; it is one coherent beam along z."""
         path, *slopes = self._path.at(*self._places(x, y, pupil))
-        p = [_like(x, slope / h) for slope, h in zip(slopes, pupil.half_size, strict=True)]
+        p = [_like(x, slope / h) for slope, h in zip(slopes, self._half_size(pupil), strict=True)]
         return Field((*p, (1.0 - p[0] ** 2 - p[1] ** 2) ** 0.5), _like(x, path), self.irradiance(x, y, pupil))
 
     def irradiance(self, x, y, pupil: Pupil) -> Any:
