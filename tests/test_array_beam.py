@@ -1,4 +1,4 @@
-"""Arrays of lenslets in the beam of a laser: a beam homogeniser."""
+"""Arrays of lenslets in the beam of a laser, a beam homogeniser, and in the light of a ray file."""
 
 import math
 import shlex
@@ -18,6 +18,9 @@ from caustic_cli.scene import Lens, Scene, Screen
 from caustic_cli.scene.lens import array_control
 from caustic_cli.scene.sources.gaussian import Gaussian
 from caustic_cli.scene.sources.measured_beam import MeasuredBeam
+from caustic_cli.scene.sources.rays import Measured
+from caustic_cli.scene.sources.rayset import RaySet
+from caustic_cli.studies.retrace import retrace
 
 WAVELENGTH, WAIST = 633.0, 3.0
 
@@ -94,7 +97,7 @@ def test_each_lenslet_maps_its_part_of_the_beam_onto_the_whole_picture():
         part = np.abs((erf(at) - erf(inner)) / (erf(outer) - erf(inner)))
         part = np.where(at > 0, part, 1.0 - part)
         wanted = half * (2.0 * part - 1.0)
-        off = np.minimum(np.abs(seen - wanted), np.abs(seen + wanted))
+        off = np.abs(seen - wanted)
         assert np.sqrt(np.mean(off**2)) < 0.02 * half
 
 
@@ -109,3 +112,39 @@ def test_fringes_are_told(m2, told, tmp_path, monkeypatch, capfd):
     said = capfd.readouterr().err
     assert ("in fringes of 0.039 mm" in said) == told
     assert "interferes, in fringes" in said or not told
+
+
+# Rays of a file
+
+
+def led(rays: int, position, tilt=(0.0, 0.0)) -> Measured:
+    """Rays of a spot of 0.1 mm, into all directions up to 0.25 to z in x and y."""
+    rng = np.random.default_rng(0)
+    directions = np.column_stack([rng.uniform(-0.25, 0.25, (rays, 2)), np.ones(rays)])
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    starts = np.column_stack([rng.normal(0.0, 0.02, (rays, 2)), np.zeros(rays)])
+    return Measured(RaySet(starts, directions, np.full(rays, 1.0 / rays)), position, 1.0, tilt)
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (5.0, -3.0)], ids=["along z", "tilted"])
+def test_rays_of_a_file_move_with_their_origin(tilt):
+    source, pupil = led(1000, (1.0, -2.0, -40.0), tilt), Lens((8.0, 8.0)).pupil
+    x, y, _ = source.crossing(pupil)
+    moved = source.displaced(lambda at: (at[0] - 2.5, at[1] + 1.5, at[2]), 1.0)
+    a, b, _ = moved.crossing(pupil)
+    np.testing.assert_allclose(a, x - 2.5, atol=1e-9)
+    np.testing.assert_allclose(b, y + 1.5, atol=1e-9)
+
+
+def test_an_array_in_the_light_of_a_ray_file():
+    """The picture by rays of the file that the transport was not told one by one, and the light on each lenslet, counted."""
+    x = np.linspace(-1.0, 1.0, 32)
+    goal = np.exp(-3.0 * (x[:, None] ** 2 + (x[None, :] - 0.2) ** 2)) + 0.2
+    control = tuple(array_control(n, 3, 2) for n in (60, 60))
+    lens = Lens((8.0, 8.0), index=1.5, control=control, array=(2, 2), fresnel="none")
+    scene = Scene(led(600_000, (1.0, -2.0, -38.0)), lens, Screen((24.0, 24.0), 120.0, (32, 32)))
+    at_x, at_y, met = scene.source.crossing(scene.pupil)
+    counted = np.histogram2d(at_x[met], at_y[met], ([-4, 0, 4], [-4, 0, 4]))[0].ravel()
+    assert [one.share for one in lenslets(scene)] == pytest.approx(list(counted / counted.sum()), rel=0.02)
+    heights = initial_array(scene, [goal], control, 64).heights
+    assert retrace(scene, HeightField.of(lens), heights, goal, rays=400_000)[1]["relative_rms"] < 0.11

@@ -42,16 +42,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Aperture, Lens, Scene, Source
 from caustic_cli.scene.packing import ConvexAperture, DiscAperture
-from caustic_cli.scene.traits import Capability
 
-LENSLETS = Capability(
-    "lenslet arrays",
-    {
-        **dict.fromkeys(
-            ("ray file", "ray file among sources"), "⟨lens.array⟩ does not divide the rays of a file among its lenslets"
-        ),
-    },
-)
 #: Cells along a lenslet by which the light on it is summed; slack of a number of cells.
 CELLS, SLACK = 16, 1e-9
 
@@ -167,7 +158,6 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
         InputError: no light falls on a lenslet.
     """
     lens, screen = scene.lens, scene.screen
-    LENSLETS.refuse(scene)
     spaces = HeightField.of(replace(lens, control=control or lens.control)).spaces
     found, known = [], dict[tuple[int, float, float], SplineSection]()
     for k in range(math.prod(lens.array)):

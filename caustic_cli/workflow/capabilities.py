@@ -14,7 +14,6 @@ PLACES = (
     "optics.waves.unsupported:WAVE_REFINEMENT",
     "optics.waves.unsupported:WAVES_BY_DEFAULT",
     "inverse.gradient_index:INDEX_DESIGN",
-    "inverse.lenslets:LENSLETS",
     "inverse.reachability:REACHABILITY",
     "inverse.source_limits:LIMITS",
     "inverse.source_limits:CONVOLUTION",

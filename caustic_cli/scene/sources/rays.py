@@ -91,6 +91,10 @@ class Measured(Source):
         """All rays of the file."""
         return 1.0, "by all rays of the file"
 
+    def displaced(self, place, scale: float, axis=None) -> Source:
+        """The rays from another origin, along the same directions."""
+        return replace(self, rays=self.turned, position=place(self.origin.tolist()), tilt=(0.0, 0.0))
+
     def pointlike(self) -> Source:
         """A point source at the point of closest approach."""
         return Points((self.centre,), (self.power,))
