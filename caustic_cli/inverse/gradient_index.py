@@ -54,10 +54,10 @@ INDEX_DESIGN = Capability(
         "far field": "⟨lens.gradient⟩ free is designed for a screen at a distance, not for ⟨+throw⟩ inf",
         "light not parallel": "⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane",
         **dict.fromkeys(("other elements", "folded axis"), "⟨lens.gradient⟩ free is designed for light that goes straight on"),
-        **dict.fromkeys(
-            ("mirror", "coloured picture"), "⟨lens.gradient⟩ free is designed for lenses, and for pictures without colours"
-        ),
+        "mirror": "⟨lens.gradient⟩ free is designed for lenses: no light enters a mirror",
+        "coloured picture": "⟨lens.gradient⟩ free is designed for pictures without colours",
     },
+    {"mirror": "no light enters it", "other elements": "index and rays are solved for along the axis"},
 )
 #: Fixed-point iterations of the initial sines.
 SINES = 3

@@ -285,10 +285,8 @@ def check_positions(elements: Sequence[Component], lens: tuple[float, float], so
         )
 
 
-BESIDE_ELEMENTS = Capability(
+BESIDE_ELEMENTS = Capability.because(
     "other elements",
-    {
-        "mirror": "⟨{setting}⟩ cannot be combined with ⟨element⟩: it sends light back through what stands before it, and elements"
-        " are passed once"
-    },
+    {"it sends light back through what stands before it, and elements are passed once": ("mirror",)},
+    "⟨{{setting}}⟩ cannot be combined with ⟨element⟩: {reason}",
 )

@@ -111,6 +111,11 @@ class Capability:
         each = {trait: reason for reason, traits in reasons.items() for trait in traits}
         return cls(name, {trait: message.format(reason=reason) for trait, reason in each.items()}, each)
 
+    def reason(self, trait: str) -> str:
+        """Why a trait is not supported, in a phrase; "" where its message gives settings instead."""
+        message = self.unsupported[trait]
+        return self.reasons.get(trait, "" if set(message) & set("⟨{") else message)
+
     def obstacle(self, scene: Scene) -> str:
         """The first trait of a scene that is not supported, "" if there is none."""
         return next((name for name in self.unsupported if TRAITS[name].found_in(scene)), "")

@@ -46,7 +46,7 @@ def matrix() -> str:
         groups: dict[str, list[str]] = {}
         for name in TRAITS:
             if name in one.unsupported:
-                groups.setdefault(one.reasons.get(name, ""), []).append(TRAITS[name].words)
+                groups.setdefault(one.reason(name), []).append(TRAITS[name].words)
         if groups:
             said = "; ".join(", ".join(words) + (f" ({reason})" if reason else "") for reason, words in groups.items())
             alike.setdefault(said, []).append(one.name)

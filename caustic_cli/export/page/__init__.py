@@ -80,16 +80,11 @@ TRACED = frozenset(
 )
 #: Additive quasi-random sequence R2 in the unit square, powers of the inverse plastic number (Roberts 2018).
 EVEN = (0.7548776662466927, 0.5698402909980532)
-FILE = (
-    "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file; ⟨source.type⟩ renders it under another"
-    " light"
-)
-PAGE = Capability(
+PAGE = Capability.because(
     "interactive page",
-    {
-        "ray file": FILE,
-        "ray file among sources": FILE,
-    },
+    {"so few of them as a page holds leave a grainy picture": ("ray file", "ray file among sources")},
+    "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file, since {reason}; ⟨source.type⟩ renders it"
+    " under another light",
 )
 
 

@@ -21,28 +21,25 @@ WAVE_IMAGE = Capability(
     "wave image",
     dict.fromkeys(("ray file", "ray file among sources"), "a ray file contains no phase"),
 )
-WAVE_REFINEMENT = Capability(
+WAVE_REFINEMENT = Capability.because(
     "design by waves",
-    {trait: f"⟨design.waves⟩ on: {why}, so that it has no wave image to refine" for trait, why in WAVE_IMAGE.unsupported.items()},
+    {why: tuple(WAVE_IMAGE.unsupported) for why in WAVE_IMAGE.unsupported.values()},
+    "⟨design.waves⟩ on: {reason}, so that it has no wave image to refine",
 )
-WAVES_BY_DEFAULT = Capability(
+_ASKED = Capability.because(
     "design by waves unless asked for",
     {
-        **WAVE_IMAGE.unsupported,
-        "several sources": "it takes a wave image of each of several sources; ⟨waves⟩ on refines them all the same",
-        "two sides": "behind the creases of a free-form entrance rays cross inside the glass, and light without a single wavefront"
-        " has none; ⟨waves⟩ on refines the exit where there are no creases",
-        "other elements": "behind other elements it takes many samples, or a part of the light; ⟨waves⟩ on refines it all the same",
-        "lenslet array": "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on"
-        " refines it",
-        **dict.fromkeys(
-            ("tilted screen", "curved screen"),
-            "on a tilted or curved screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same",
-        ),
-        "tilted light": "in tilted light it holds for surfaces that are smooth over the Fresnel scale of their depth along the"
-        " light; ⟨waves⟩ on refines it all the same",
+        "it takes a wave image of each of several sources": ("several sources",),
+        "behind the creases of a free-form entrance light has no single wavefront": ("two sides",),
+        "it takes many samples, or a part of the light": ("other elements",),
+        "light of lenslets side by side interferes in fine fringes, which rays alone pass over": ("lenslet array",),
+        "it takes many transforms for each wavelength": ("tilted screen", "curved screen"),
+        "it holds for surfaces that are smooth over the Fresnel scale of their depth along the light": ("tilted light",),
     },
+    "{reason}; ⟨waves⟩ on refines it all the same",
 )
+#: Scenes whose wave image is refined on request only, where there is one.
+WAVES_BY_DEFAULT = Capability(_ASKED.name, {**WAVE_IMAGE.unsupported, **_ASKED.unsupported}, _ASKED.reasons)
 
 
 def refuse_without_image(scene: Scene) -> None:

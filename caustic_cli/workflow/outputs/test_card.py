@@ -15,9 +15,10 @@ class TestCard(Output):
     """The sheet, and a table of its marks."""
 
     option: ClassVar[str] = "test_card"
-    capability: ClassVar[Capability] = Capability(
+    capability: ClassVar[Capability] = Capability.because(
         "test cards",
-        dict.fromkeys(("unrollable screen", "far field"), "a test card is a sheet of paper, which does not lie on {}"),
+        {"a sheet of paper does not lie there": ("unrollable screen", "far field")},
+        "a test card is a sheet of paper, which does not lie on {{}}",
     )
     files: ClassVar[tuple[str, ...]] = ("card.png", "card.csv")
     beyond: ClassVar[bool] = True
