@@ -55,7 +55,7 @@ def write_lighttools(
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
     screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_sources`; fresnel unless exact; aperture if a circle;
-    mirror, 1, of one; those of `_gradient`, `_lenslets`, `_glass`, `_light` and `_elements`; those of `_entrance` where it is
+    mirror, 1, of one; those of `_lens`, `_light` and `_elements`; those of `_entrance` where it is
     free-form; control_points (n, m, 3) with x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit,
     format_version, created_by.
 
@@ -89,10 +89,7 @@ def write_lighttools(
         "resolution": np.array(scene.screen.resolution, np.int64),
         **_screen(scene.screen),
         **_sources(scene),
-        **{key: np.array(value) for key, value, usual in _unusual(scene.lens) if value != usual},
-        **_gradient(scene.lens),
-        **_lenslets(scene.lens),
-        **_glass(scene.lens),
+        **_lens(scene.lens),
         **_light(scene.light),
         "control_points": np.asfortranarray(control_points(field, net)),
         "degrees": np.array([s.degree for s in field.spaces], np.int64),
@@ -175,6 +172,12 @@ def _gradient(lens: Lens) -> dict[str, np.ndarray]:
     if given.volume is not None:
         return {"gradient": np.array(given.kind), "gradient_volume": _reals(given.volume)}
     return {"gradient": np.array(given.kind), "gradient_terms": _reals(given.terms)}
+
+
+def _lens(lens: Lens) -> dict[str, np.ndarray]:
+    """Optional keys of the lens: those that are not as usual, and of `_gradient`, `_lenslets` and `_glass`."""
+    found = {key: np.array(value) for key, value, usual in _unusual(lens) if value != usual}
+    return found | _gradient(lens) | _lenslets(lens) | _glass(lens)
 
 
 def _lenslets(lens: Lens) -> dict[str, np.ndarray]:
