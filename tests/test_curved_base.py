@@ -398,8 +398,6 @@ def test_four_axes_are_for_the_outside_of_a_cylinder(tmp_path):
         with pytest.raises(InputError, match="outside of a cylinder"):
             write_gcode(tmp_path / "r.nc", part, Milling(path="rotary"))
     tube = scene_of(TUBE)
-    with pytest.raises(InputError, match="belongs to another"):
-        write_gcode(tmp_path / "r.nc", part_of("gcode", tube, *on_base(tube)), Milling(path="rotary", roughing=1.0))
     with pytest.raises(InputError, match="must reach the surface's highest point"):
         write_gcode(tmp_path / "r.nc", part_of("gcode", tube, *on_base(tube)), Milling(path="rotary", stock=29.0, scallop=0.1))
 

@@ -82,7 +82,8 @@ class Part:
     """Part in a file.
 
     scene: with z_in of the lens at the flat face; field, heights: the surface, (n, m) mm; kind: lens, mirror or mould; turned:
-    whether it is rotated, the (x, y, z) of the scene being (x, -y, -z) here; register: to the other side, of a lens with two.
+    whether it is rotated, the (x, y, z) of the scene being (x, -y, -z) here; register: to the other side, of a lens with two;
+    others: surfaces of the other panels of a ring, in their order around the axis (`export.panels`).
     """
 
     scene: Scene
@@ -91,6 +92,7 @@ class Part:
     kind: str
     turned: bool = False
     register: Register | None = None
+    others: tuple[tuple[HeightField, Tensor], ...] = ()
 
     @property
     def face(self) -> str:

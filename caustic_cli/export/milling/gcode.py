@@ -9,8 +9,7 @@ default a hundredth of the scallop height.  With curvature k along the path the 
 / 8 and its ends by the slope sqrt(2 t k), compared with sqrt(2 h / R) of scallops: a tenth of that for k = 1 / R, and less for
 smaller k.  Rounding of coordinates is below a tenth of the tolerance.
 
-Roughing removes the stock in layers by a raster, at a tolerance relative to the allowance, above the offset surface, with a
-step-over of half the tool radius.
+Roughing (`roughing`) removes the stock in layers above the offset surface.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from caustic_cli.export.milling import ROTARY, TURNING, Milling
 from caustic_cli.export.milling.offset import BallOffset, FlatOffset, shape_of
 from caustic_cli.export.milling.paths import batches, raster, spacing, spiral, with_heights
 from caustic_cli.export.milling.rotary import write_rotary
+from caustic_cli.export.milling.roughing import rough
 from caustic_cli.export.milling.turning import write_turning
 from caustic_cli.export.milling.writer import (
     FIRST_MOVE,
@@ -42,12 +42,11 @@ from caustic_cli.export.part import Part, Register
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Aperture
 from caustic_cli.schema import checks
 from caustic_cli.schema.checks import LENGTH
 
-#: Roughing: step-over over the radius, tolerance over the allowance.
-ROUGH_STEP, ROUGH_PART = 0.5, 0.05
+#: Cutter-location surfaces of the tools that rough.
+ROUGHING = {"ball": BallOffset, "flat": FlatOffset}
 #: Depth of the holes for pins, in their diameters, and what is left below them at least, in parts of the stock.
 HOLE, FLOOR = 3.0, 0.1
 #: mm of an inch.
@@ -94,9 +93,8 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
         if part.register is not None and part.register.drills(part.turned):
             _drill(out, m, part.register, safe)
         if m.roughing is not None:
-            begin(out, m.roughing_tool, m.rough_radius, m.spindle, safe)
-            _rough(out, m, field, heights, part.lens.opening, top, low, safe)
-            out.say("M5", "M0 (change the tool)")
+            offset = ROUGHING[m.roughing_tool](field, heights, m.rough_radius, m.allowance)
+            rough(out, m, offset, part.lens.opening.grown(0.5 * m.rough_radius), top, low)
         begin(out, "ball", m.tool_radius, m.spindle, safe)
         _finish(out, m, field, heights, passes, top, tolerance)
         out.end(safe)
@@ -161,30 +159,3 @@ def _finish(
             descend(out, points[0], top, m.plunge)
             first = False
         out.cut(points, m.feed)
-
-
-def _rough(
-    out: Writer, m: Milling, field: HeightField, heights: Tensor, aperture: Aperture, top: float, low: float, safe: float
-) -> None:
-    """Write layers from the top of the stock down to the allowance above the surface."""
-    make, radius = {"ball": BallOffset, "flat": FlatOffset}[m.roughing_tool], m.rough_radius
-    offset = make(field, heights, radius, m.allowance)
-    deep = top - low - m.allowance
-    if deep <= 0:
-        return
-    layers = math.ceil(deep / m.roughing)
-    for k in range(1, layers + 1):
-        floor, above = top - deep * k / layers, top - deep * (k - 1) / layers
-
-        def height(x: np.ndarray, y: np.ndarray, floor: float = floor) -> np.ndarray:
-            return np.maximum(offset(x, y), floor)
-
-        for line in raster(aperture.grown(0.5 * radius), ROUGH_STEP * radius):
-            points = with_heights(line, height, FIRST_MOVE * radius, ROUGH_PART * m.allowance)
-            kept = points[:, 2] < above  # elsewhere the material is removed already, or the surface reached
-            for run in np.split(np.arange(len(points)), np.flatnonzero(np.diff(kept.astype(int))) + 1):
-                if kept[run[0]]:
-                    run = points[max(0, run[0] - 1) : run[-1] + 2]  # including a point above on either side
-                    descend(out, np.array([*run[0, :2], max(run[0, 2], floor)]), top, m.plunge)
-                    out.cut(run, m.feed)
-                    out.rapid(z=safe)

@@ -16,6 +16,7 @@ height the grid may find the lower one, so the contact points of tools half a sa
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 #: Samples per knot span, at most so many, and per tool radius; at most in all: for the initial contact point.  For 3003 x 3003
 #: control points and a ball of a fifth of the lens, 1001 samples give the heights of 6001 to 4e-15 mm at 20,000 points, in a
 #: thirtieth of the time; 601 are off by up to 19 nm at three points of 10,000.
-A_SPAN, MOST_BY_SPANS, A_RADIUS, MOST = 3, 1501, 40, 6001
+A_SPAN, MOST_BY_SPANS, A_RADIUS, MOST = 3, 1501, 40, 6000
 #: Distance, samples, beyond which two contact points are distinct.
 APART = 2.0
 #: Most Newton iterations, and their tolerance over the radius.
@@ -135,13 +136,8 @@ class FlatOffset:
         wide = np.ceil(reach / self.step).astype(int)
         z = np.pad(z, [(n, n) for n in wide], constant_values=-np.inf)
         self.low = np.array([x[0], y[0]]) - wide * self.step
-        self.highest = np.full(z.shape, -np.inf)
-        for k in range(-wide[0], wide[0] + 1):  # dilation by a disc, decomposed into chords
-            across = reach**2 - (k * self.step[0]) ** 2
-            if across >= 0:
-                chord = maximum_filter1d(z, 2 * int(math.sqrt(across) / self.step[1]) + 1, 1, mode="constant", cval=-np.inf)
-                to, of = slice(max(0, -k), len(z) - max(0, k)), slice(max(0, k), len(z) - max(0, -k))
-                np.maximum(self.highest[to], chord[of], out=self.highest[to])
+        across = reach**2 - (np.arange(wide[0] + 1) * self.step[0]) ** 2
+        self.highest = dilated(z, [int(math.sqrt(c) / self.step[1]) for c in across if c >= 0])
         self.more = half * field.slope_bound(heights) + allowance
 
     def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -154,13 +150,26 @@ class FlatOffset:
         return found
 
 
+def dilated(z: np.ndarray, reach: Sequence[int], weights: Sequence[float] | None = None) -> np.ndarray:
+    """Highest sample under a tool at each: z (n, m), maximum over the rows k away and the columns up to reach[k] away, times
+    weights[k], 1 unless given: dilation by a disc, decomposed into chords."""
+    highest = np.full(z.shape, -np.inf)
+    for k, (wide, weight) in enumerate(zip(reach, weights or [1.0] * len(reach), strict=True)):
+        chord = weight * maximum_filter1d(z, 2 * wide + 1, 1, mode="constant", cval=-np.inf)
+        for to, of in ((slice(k, None), slice(None, len(z) - k)), (slice(None, len(z) - k), slice(k, None))):
+            np.maximum(highest[to], chord[of], out=highest[to])
+    return highest
+
+
+def steps_of(space: SplineSpace, length: float, radius: float) -> int:
+    """Steps between the samples along an axis of this length, for a tool of this radius, mm."""
+    spans = len(space.breaks) - 1
+    return min(MOST, max(min(A_SPAN * spans, MOST_BY_SPANS - 1), math.ceil(length * A_RADIUS / radius)))
+
+
 def _samples(field: HeightField, heights: Tensor, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Grid lines (a,), (b,) over the aperture, borders included, mm, and heights (a, b) mm."""
 
-    def line(space: SplineSpace, r: float) -> Tensor:
-        spans = len(space.breaks) - 1
-        steps = max(min(A_SPAN * spans, MOST_BY_SPANS - 1), math.ceil(2.0 * r * A_RADIUS / radius))
-        return torch.linspace(0.0, 1.0, min(MOST, steps + 1), dtype=torch.float64)
-
-    grid = on_lines(field, heights, [line(s, r) for s, r in zip(field.spaces, field.half_size, strict=True)])
+    counts = [steps_of(s, 2.0 * r, radius) + 1 for s, r in zip(field.spaces, field.half_size, strict=True)]
+    grid = on_lines(field, heights, [torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in counts])
     return grid.x, grid.y, grid.z

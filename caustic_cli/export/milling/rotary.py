@@ -1,34 +1,32 @@
-"""Programs for a mill with a rotary axis: a relief on the outside of a cylinder, by a ball that points to the axis of the part.
+"""Programs for a mill with a rotary axis: a relief on the outside of a cylinder, or a ring of them, by tools that point to the axis
+of the part.
 
 X0 is the middle of the part, X along the axis of the cylinder, A the angle about it, A0 at the vertex, and Z the distance of the
-ball's tip from that axis, which is Z0; Y stays 0.  Directions are those of ISO 841, as if the tool moved around the part: at A it
+tool's tip from that axis, which is Z0; Y stays 0.  Directions are those of ISO 841, as if the tool moved around the part: at A it
 is over Y = -Z sin A.  Passes run along X, in G94, and A turns between them alone.
 
 Notation
-    R_0, z_a    radius of the base cylinder, and height of its axis, mm;  R  radius of the ball
-    a, b        coordinates along the axis and across it, b = (z - z_a) tan theta;  s = R_0 theta
-    C(a, b)     height of the ball's centre above the plane (`offset`): no ball above it cuts into the part, from whatever side it
-                comes, so that its surface also bounds the centres of balls that come along the radius
-    rho         sqrt(b^2 + (C - z_a)^2), distance of the centre from the axis; the tip is at rho - R
+    R_0, a, theta, rho    of the base cylinder, see `export.panels`;  s = R_0 theta;  R  radius of the tool
 
-At an angle theta the centre is at the b with b cos theta = (C - z_a) sin theta, found by a chord iteration with the derivative
-1 / cos theta of a cylinder.  A linear move of A and Z is one of s and rho, in which moves are within a tolerance.  Passes a
-distance s apart on the cylinder leave scallops as on a plane for s sqrt(1 + R / R_0), since both the ball and the cylinder are
-convex.
+The tip follows the cutter-location surfaces of `radial`.  A linear move of A and Z is one of s and rho, in which moves are within a
+tolerance.  Passes a distance s apart on the cylinder leave scallops as on a plane for s sqrt(1 + R / R_0), since both the ball and
+the cylinder are convex.  Roughing (`roughing`) removes layers of constant radius first; its flat end leaves s^2 / (8 R_0) between
+passes, and on the cylinder no more.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from caustic_cli.errors import InputError
 from caustic_cli.export.milling import Milling
-from caustic_cli.export.milling.offset import BallOffset, shape_of
+from caustic_cli.export.milling.offset import shape_of
 from caustic_cli.export.milling.paths import batches, raster, spacing, with_heights
+from caustic_cli.export.milling.radial import RadialBall, RadialFlat
+from caustic_cli.export.milling.roughing import ROUGH_PART, ROUGH_STEP, rough
 from caustic_cli.export.milling.writer import (
     FIRST_MOVE,
     MOST_OVER,
@@ -39,84 +37,70 @@ from caustic_cli.export.milling.writer import (
     digits_of,
     figures_of,
 )
+from caustic_cli.export.panels import Panels
 from caustic_cli.export.part import Part
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_file
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Aperture
 
-#: Chord iterations, whose error falls by the slope of the relief each time, and their tolerance over the radius of the ball.
-STEPS, STILL = 30, 1e-10
-#: Points along each axis at which slopes and edges are sampled.
-SAMPLES = 401
+#: Cutter-location surfaces of the tools that rough.
+ROUGHING = {"ball": RadialBall, "flat": RadialFlat}
 
 
-class _Cylinder:
-    """The base cylinder of a part.
+@dataclass(frozen=True, eq=False)
+class _Finishing:
+    """Finishing of panels: step-over, scallops and tolerance, mm, and how far passes go beyond the panels, mm."""
 
-    Raises:
-        InputError: the base surface is no cylinder that is convex on the side of the tool.
-    """
+    panels: Panels
+    m: Milling
+    step: float
+    scallop: float
+    tolerance: float
+    over: float
 
-    def __init__(self, part: Part):
-        lens, radii = part.lens, part.lens.offset.radius
-        if part.kind != "lens" or sum(map(math.isinf, radii)) != 1 or min(radii) > 0:
-            raise InputError(
-                "⟨path⟩ rotary needs the outside of a cylinder, a lens of ⟨lens.radius⟩ -R,inf or inf,-R, and no mould, got radii"
-                f" of {radii[0]:g} and {radii[1]:g} mm"
-            )
-        #: The coordinate with curvature, 0 for x, 1 for y; R_0 and z_a.
-        self.bent = int(math.isinf(radii[0]))
-        self.radius = -radii[self.bent]
-        self.axis = lens.offset.thickness - self.radius
+    @classmethod
+    def of(cls, panels: Panels, m: Milling, tolerance: float | None) -> _Finishing:
+        concave, slope = max(shape_of(*side)[3] for side in panels.unlike), panels.slope
+        wider = math.sqrt(1.0 + m.tool_radius / panels.cylinder.radius)
+        step = m.step(concave, slope) / wider
+        over = min(MOST_OVER * m.tool_radius, m.tool_radius * slope / math.sqrt(1.0 + slope * slope) + step)
+        step = spacing("raster", _outline(panels, over, step), step)
+        scallop = m.scallop_of(step * wider, concave, slope)
+        return cls(panels, m, step, scallop, PATH_PART * scallop if tolerance is None else tolerance, over)
 
-    def lens_xy(self, along: np.ndarray, across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """x and y of points (a, b)."""
-        return (across, along) if self.bent == 0 else (along, across)
+    @property
+    def outline(self) -> Aperture:
+        """Of its passes over a and s."""
+        return _outline(self.panels, self.over, self.step)
 
-    def program(self, points: np.ndarray) -> np.ndarray:
-        """X, mm, A, degrees, and Z, mm, of points (a, s, Z), (m, 3): X, Y, Z is right-handed with X = y, Y = -x, or with x, y."""
-        turn = np.degrees(points[:, 1] / self.radius) * (1.0 if self.bent == 0 else -1.0)
-        return np.stack([points[:, 0], turn, points[:, 2]], -1)
-
-    def shape(self, part: Part) -> tuple[float, float, float]:
-        """Greatest distance of the surface from the axis, mm; greatest angle to the vertex, rad; largest slope against the
-        cylinder."""
-        half = part.lens.half_size
-        x, y = (torch.linspace(-r, r, SAMPLES, dtype=torch.float64) for r in half)
-        x, y = (c.reshape(-1) for c in torch.meshgrid(x, y, indexing="ij"))
-        z, zx, zy = (c.numpy() for c in part.field.at(part.heights, x, y))
-        across, leans = (x.numpy(), zx) if self.bent == 0 else (y.numpy(), zy)
-        far = np.hypot(across, z - self.axis)
-        cosine = (z - self.axis - across * leans) / (far * np.sqrt(1.0 + zx * zx + zy * zy))
-        if not cosine.min() > 0:
-            raise InputError("⟨path⟩ rotary: the relief is steeper than a tool along the radius reaches")
-        slope = math.sqrt(1.0 / float(cosine.min()) ** 2 - 1.0)
-        return float(far.max()), float(np.abs(np.arctan2(across, z - self.axis)).max()), slope
+    def write(self, out: Writer, top: float, unit: float) -> None:
+        """Write the passes, from the top of the stock on."""
+        m, first, offset = self.m, True, RadialBall(self.panels, self.m.tool_radius)
+        spans = (2.0 * r / (len(s.breaks) - 1) for f, _ in self.panels.unlike for s, r in zip(f.spaces, f.half_size, strict=True))
+        move = min(FIRST_MOVE * m.tool_radius, *spans)
+        for line in batches(raster(self.outline, self.step), move):
+            points = _program(self.panels, with_heights(line, offset, move, self.tolerance), unit)
+            if first:
+                descend(out, points[0], top, m.plunge)
+            first = False
+            out.cut(points, m.feed)
 
 
-class RadialOffset:
-    """Distances of the tip of a ball from the axis of a cylinder, where it comes along the radius; see the module."""
+def _outline(panels: Panels, over: float, step: float) -> Aperture:
+    """Of passes over a and s, that far beyond the panels; of a ring once around, at least as close as the step-over."""
+    around = panels.cylinder.radius * panels.turn + over
+    if panels.closed:
+        whole = 2.0 * math.pi * panels.cylinder.radius
+        around = 0.5 * whole * (1.0 - 1.0 / math.ceil(whole / step * (1.0 - 1e-9)))
+    return Aperture((panels.half + over, around))
 
-    def __init__(self, cylinder: _Cylinder, field: HeightField, heights: torch.Tensor, radius: float):
-        self.cylinder, self.radius, self.offset = cylinder, radius, BallOffset(field, heights, radius)
 
-    def __call__(self, along: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """(N,) mm at a, s (N,) mm; NaN where the ball does not touch the surface."""
-        theta = s / self.cylinder.radius
-        sine, cosine = np.sin(theta), np.cos(theta)
-        across, height = (self.cylinder.radius + self.radius) * sine, np.full(len(s), np.nan)
-        busy = np.arange(len(s))
-        for _ in range(STEPS):
-            if not len(busy):
-                break
-            found = self.offset(*self.cylinder.lens_xy(along[busy], across[busy])) + self.radius - self.cylinder.axis
-            height[busy] = found
-            move = (across[busy] * cosine[busy] - found * sine[busy]) * cosine[busy]
-            left = np.abs(move) > STILL * self.radius  # not where it is NaN
-            across[busy[left]] -= move[left]
-            busy = busy[left]
-        return np.hypot(across, height) - self.radius
+def _program(panels: Panels, points: np.ndarray, unit: float) -> np.ndarray:
+    """X, mm, A, degrees, and Z, mm, of points (a, s, Z), (m, 3): X, Y, Z is right-handed with X = y, Y = -x, or with x, y; `Writer`
+    divides by the program's unit, mm, which A does not have."""
+    cylinder = panels.cylinder
+    turn = np.degrees(points[:, 1] / cylinder.radius) * (unit if cylinder.bent == 0 else -unit)
+    return np.stack([points[:, 0], turn, points[:, 2]], -1)
 
 
 def write_rotary(path: str | Path, part: Part, m: Milling, tolerance: float | None, unit: float, simple: bool) -> dict:
@@ -128,49 +112,52 @@ def write_rotary(path: str | Path, part: Part, m: Milling, tolerance: float | No
     Raises:
         InputError: the part is not the outside of a cylinder, or the stock is below its surface.
     """
-    if m.roughing is not None:
-        raise InputError("⟨roughing⟩ belongs to another ⟨path⟩ than rotary: a relief on a finished cylinder is shallow")
-    cylinder = _Cylinder(part)
-    _, _, _, concave = shape_of(part.field, part.heights)
-    high, turn, slope = cylinder.shape(part)
-    wider = math.sqrt(1.0 + m.tool_radius / cylinder.radius)
-    step = m.step(concave, slope) / wider
-    over = min(MOST_OVER * m.tool_radius, m.tool_radius * slope / math.sqrt(1.0 + slope * slope) + step)
-    outline = Aperture((part.lens.half_size[1 - cylinder.bent] + over, cylinder.radius * turn + over))
-    step = spacing("raster", outline, step)
-    scallop = m.scallop_of(step * wider, concave, slope)
-    tolerance = PATH_PART * scallop if tolerance is None else tolerance
-    top = m.top(high)
+    panels = Panels.of(part, part.others, "⟨path⟩ rotary")
+    finishing, top = _Finishing.of(panels, m, tolerance), m.top(panels.high)
     with atomic_file(path) as file:
-        out = Writer(file, digits_of(tolerance / unit), unit, simple, letters="XAZ")
-        out.start(*_head(part, cylinder, m, step, scallop, top, tolerance))
+        out = Writer(file, digits_of(finishing.tolerance / unit), unit, simple, letters="XAZ")
+        out.start(*_head(part, finishing, top))
+        if m.roughing is not None:
+            _rough(out, finishing, top, unit)
         begin(out, "ball", m.tool_radius, m.spindle, top + m.safe_height)
-        offset, first = RadialOffset(cylinder, part.field, part.heights, m.tool_radius), True
-        spans = (2.0 * r / (len(s.breaks) - 1) for s, r in zip(part.field.spaces, part.field.half_size, strict=True))
-        move = min(FIRST_MOVE * m.tool_radius, *spans)
-        for line in batches(raster(outline, step), move):
-            points = cylinder.program(with_heights(line, offset, move, tolerance)) * [1.0, unit, 1.0]  # A has no unit of length
-            if first:
-                descend(out, points[0], top, m.plunge)
-            first = False
-            out.cut(points, m.feed)
+        finishing.write(out, top, unit)
         out.end(top + m.safe_height)
-    turned = math.degrees(outline.half_size[1] / cylinder.radius)
-    return figures_of(out, out.minutes, m.tool_radius, step, scallop, tolerance, top) | {"turned_deg": turned}
+    figures = figures_of(out, out.minutes, m.tool_radius, finishing.step, finishing.scallop, finishing.tolerance, top)
+    turned = 180.0 if panels.closed else math.degrees(finishing.outline.half_size[1] / panels.cylinder.radius)
+    return figures | {"turned_deg": turned}
 
 
-def _head(part: Part, cylinder: _Cylinder, m: Milling, step: float, scallop: float, top: float, tolerance: float) -> list[str]:
+def _rough(out: Writer, finishing: _Finishing, top: float, unit: float) -> None:
+    """Write the roughing passes: as far beyond the panels as the ball of finishing cuts, and down to the allowance above the lowest
+    point at most, whether or not the tool touches the surface there."""
+    panels, m = finishing.panels, finishing.m
+    allowance = m.allowance * (1.0 + ROUGH_PART)  # its moves are within a tolerance
+    offset = ROUGHING[m.roughing_tool](panels, m.rough_radius, allowance)
+    over = max(0.5 * m.rough_radius, finishing.over + m.tool_radius - m.rough_radius)
+
+    def height(along: np.ndarray, s: np.ndarray) -> np.ndarray:
+        return np.fmax(offset(along, s), panels.low + allowance)
+
+    outline = _outline(panels, over, ROUGH_STEP * m.rough_radius)
+    rough(out, m, height, outline, top, panels.low, lambda points: _program(panels, points, unit))
+
+
+def _head(part: Part, finishing: _Finishing, top: float) -> list[str]:
     """Header comments."""
+    panels, m = finishing.panels, finishing.m
+    cylinder = panels.cylinder
     axis, across = ("y", "-x") if cylinder.bent == 0 else ("x", "y")
+    ring = [f"(ring: {len(panels.sides)} panels of {2.0 * math.degrees(panels.sector):.6g} degrees)"] if panels.closed else []
     return [
         f"({CREATED})",
         f"(part: {part.kind}, on a cylinder of radius {cylinder.radius:g} mm, with a rotary axis A about X)",
+        *ring,
         f"(X0: the middle of the part; X is its {axis}, Y0 its axis, Y would be {across})",
         f"(Z0: the axis of the cylinder and of A, {cylinder.axis:.17g} mm is its z in other formats; X Z are of the tool's tip)",
         "(A: degrees from the vertex, as if the tool moved around the part: it is over Y = -Z sin A)",
         f"(rotary: axis along {axis} at z = {cylinder.axis:.17g} mm)",
-        f"(blank: a cylinder or tube, outer radius at least {top:g} mm, or as it is)",
-        f"(finishing: passes along X, step-over {step:.6g} mm on the cylinder, scallops up to {scallop:.3g} mm, moves within"
-        f" {tolerance:.3g} mm)",
+        f"(blank: a cylinder or tube, outer radius {f'{top:g} mm' if m.roughing else f'at least {top:g} mm, or as it is'})",
+        f"(finishing: passes along X, step-over {finishing.step:.6g} mm on the cylinder, scallops up to {finishing.scallop:.3g} mm,"
+        f" moves within {finishing.tolerance:.3g} mm)",
         f"(units: {'inches' if m.dialect.endswith('inch') else 'mm'} and degrees, F of moves along X and Z; comments in mm)",
     ]
