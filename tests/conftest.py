@@ -125,6 +125,9 @@ LONG = (
     "test_both_sides_have_form_errors_of_their_own",
     "test_steps_are_those_of_a_true_staircase[printer1]",
     "test_steps_are_those_of_a_true_staircase[printer2]",
+    "test_ring_is_milled_in_one_program",
+    "test_roughing_in_four_axes_leaves_its_allowance[radius0-how0]",
+    "test_roughing_in_four_axes_leaves_its_allowance[radius1-how1]",
 )
 
 

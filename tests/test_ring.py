@@ -5,6 +5,7 @@ e(theta), its place da away along the axis, at r = rho cos(phi - theta) - sqrt(R
 end of a tool at r = Z / cos(phi - theta), if that is within its disc.
 """
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -12,13 +13,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers import write_blob
 
+from caustic_cli import cli
+from caustic_cli.errors import InputError
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.milling.gcode import write_gcode
+from caustic_cli.export.panels import Panels
 from caustic_cli.export.part import part_of
+from caustic_cli.export.ring import ring_of
 from caustic_cli.optics.parallel import parallel_side
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.workflow.machining import cut_surface
 
 INF, WALL = math.inf, 3.0
 
@@ -76,17 +83,20 @@ def swept(stock, a, phi, kind, radius, moves):
 
 
 def relief(field, heights, axis, a, phi, bent):
-    """Distances of the surface from the axis, mm, at places a and angles phi: (n, m), by bisection along rays."""
-    shape = len(a), len(phi)
-    a, phi = (c.ravel() for c in np.meshgrid(a, phi, indexing="ij"))
-    low, high = np.full(len(a), 0.5 * abs(axis)), np.full(len(a), 2.0 * abs(axis))
-    for _ in range(60):
+    """Distances of the surface from the axis, mm, at places a and angles phi, which are broadcast, by bisection along rays."""
+    a, phi = np.broadcast_arrays(a, phi)
+    shape, a, phi = a.shape, a.ravel().copy(), phi.ravel().copy()
+    low, high = np.full(len(a), 0.8 * abs(axis)), np.full(len(a), 2.0 * abs(axis))
+    for _ in range(45):
         r = 0.5 * (low + high)
         across = torch.from_numpy(r * np.sin(phi))
         xy = (across, torch.from_numpy(a)) if bent == 0 else (torch.from_numpy(a), across)
         below = r * np.cos(phi) + axis < field.at(heights, *xy, [(0, 0)])[0].numpy()
         low, high = np.where(below, r, low), np.where(below, high, r)
     return r.reshape(shape)
+
+
+# roughing
 
 
 @pytest.mark.parametrize(
@@ -115,7 +125,7 @@ def test_roughing_in_four_axes_leaves_its_allowance(radius, how, tmp_path):
         assert moves[moves[:, 3] > 0, 2].min() > made["stock_mm"] - 1e-4  # no rapid move in the stock
         stock.append(swept(stock[-1], a, turned * phi, kind, size, moves))
     own = slice(6, -6)  # of the panel itself; finishing goes beyond its edges
-    surface = relief(field, heights, axis, a[own], phi[own], bent)
+    surface = relief(field, heights, axis, a[own, None], phi[own], bent)
     left, slope, apart = stock[1][own, own] - surface, 0.6, 0.5 * mill.rough_radius
     between = apart * slope if how["roughing_tool"] == "flat" else apart**2 / 8.0 * (1.0 / mill.rough_radius + 1.0 / 20.0)
     assert left.min() > allowance
@@ -125,3 +135,130 @@ def test_roughing_in_four_axes_leaves_its_allowance(radius, how, tmp_path):
     assert finished.min() > -2.0 * made["tolerance_mm"]
     assert finished.max() < 0.1
     assert (stock[1] - stock[2]).max() < allowance + step + between
+
+
+# rings
+
+#: Which of two panels each of the six is.
+ORDER = (0, 1, 0, 0, 1, 1)
+
+
+def ring_part(radius, format="stl", length=4.0, order=ORDER, across=10.0):
+    """Panels of 60 degrees around an axis, of two reliefs, as a part; and the two."""
+    order_of = slice(None, None, 1 if math.isinf(radius[1]) else -1)
+    size, control = (across, length)[order_of], (14, 6)[order_of]
+    (scene, field, heights), (_, *other) = (panel(radius, size, bumps=0.04, seed=k, control=control) for k in (3, 4))
+    sides = ((field, heights), tuple(other))
+    part = part_of(format, scene, field, heights)
+    return replace(part, others=tuple(sides[k] for k in order[1:])), sides
+
+
+def around(sides, radius, a, phi):
+    """Distances of the surface of the ring from the axis, mm, at places a and angles phi, which are broadcast."""
+    bent, axis = int(math.isinf(radius[0])), WALL + min(radius)
+    number = np.rint(np.degrees(phi) / 60.0)
+    turn, which = phi - np.radians(60.0 * number), np.take(ORDER, number.astype(int) % 6)
+    return np.where(which == 0, *(relief(*side, axis, a, turn, bent) for side in sides))
+
+
+@pytest.mark.parametrize("radius", [(-10.0, INF), (INF, -10.0)])
+def test_ring_is_a_closed_body_with_every_relief_in_its_place(radius):
+    part, sides = ring_part(radius)
+    ring = ring_of(Panels.of(part, part.others), part.lens, 4)
+    edges = np.concatenate([ring.faces[:, k] for k in ([0, 1], [1, 2], [2, 0])])
+    forth = set(map(tuple, edges.tolist()))
+    assert len(forth) == len(edges)  # every edge once in each direction: closed and oriented
+    assert {(b, a) for a, b in forth} == forth
+    assert len(ring.vertices) - len(edges) // 2 + len(ring.faces) == 0  # Euler's characteristic of a torus
+    bent, axis = int(math.isinf(radius[0])), WALL + min(radius)
+    across, along, up = ring.vertices[:, bent], ring.vertices[:, 1 - bent], ring.vertices[:, 2] - axis
+    rho, phi = np.hypot(across, up), np.arctan2(across, up)
+    inner = rho < 8.5
+    assert rho[inner] == pytest.approx(7.0, abs=1e-6)
+    seam = np.abs((np.degrees(phi) + 30.0 + 30.0) % 60.0 - 30.0) < 1e-6
+    some = np.flatnonzero(~inner & ~seam)[::29]
+    assert len(some) > 50
+    assert rho[some] == pytest.approx(around(sides, radius, along[some], phi[some]), abs=1e-8)
+    a, turn = np.linspace(-2.0, 2.0, 41), math.radians(0.75) * (np.arange(480) + 0.5)
+    square = np.trapezoid(around(sides, radius, a[:, None], turn) ** 2 - 49.0, a, axis=0)
+    assert ring.volume == pytest.approx(0.5 * square.mean() * 2.0 * math.pi, rel=1e-3)
+    assert 0.01 < ring.step < 0.3
+
+
+def test_edges_that_cross_at_a_mitre_leave_no_crossed_step():
+    part, _ = ring_part((-10.0, INF))
+    ring = ring_of(Panels.of(part, part.others), part.lens, 4)
+    corners = ring.vertices.astype(np.float32)[ring.faces].astype(float)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    turn = np.arctan2(corners[..., 0], corners[..., 2] - WALL + 10.0)
+    mitre = (np.abs((np.degrees(turn) + 30.0 + 30.0) % 60.0 - 30.0) < 1e-4).all(1)
+    assert 50 < mitre.sum() < 12 * 45
+    assert np.linalg.norm(normal, axis=1).min() > 1e-7  # no triangle without area, in float32 either
+
+
+def test_ring_is_milled_in_one_program(tmp_path):
+    """All the way around: no relief is cut, roughing leaves its allowance, finishing the scallops but beside the mitres, in whose
+    steps no ball fits."""
+    radius = (-10.0, INF)
+    part, sides = ring_part(radius, "gcode", 2.0)
+    mill = Milling(path="rotary", tool_radius=1.5, scallop=0.25, roughing=0.8, stock=10.6)
+    made = write_gcode(tmp_path / "ring.nc", part, mill)
+    a, phi = np.linspace(-0.95, 0.95, 15), math.radians(1.5) * (np.arange(240) + 0.5) - math.pi
+    surface, stock = around(sides, radius, a[:, None], phi), [np.full((15, 240), 10.6)]
+    for kind, size, moves in tools_of(tmp_path / "ring.nc"):
+        stock.append(swept(stock[-1], a, phi, kind, size, moves))
+    assert (stock[1] - surface).min() > mill.allowance
+    assert (stock[1] - surface).max() < mill.allowance + 0.8
+    left, beside = stock[2] - surface, np.abs((np.degrees(phi) + 60.0) % 60.0 - 30.0) < 6.0
+    assert left.min() > -2.0 * made["tolerance_mm"]
+    assert left[:, ~beside].max() < 1.05 * mill.scallop
+    assert made["turned_deg"] == 180.0
+    field, heights = sides[0]  # the first panel as the program's own reader sees it, not what is cut behind the axis
+    x, y = (c.ravel() for c in torch.meshgrid(*(torch.linspace(-r, r, 21).double() for r in (4.0, 0.9)), indexing="ij"))
+    off = (cut_surface(tmp_path / "ring.nc", part.scene, field).at(None, x, y)[0] - field.at(heights, x, y)[0]).numpy()
+    assert off.min() > -2.0 * made["tolerance_mm"]
+    assert off.max() < 1.2 * mill.scallop
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"across": 9.5}, "has 60 degrees, and these reach 57.84 around"),
+        ({"order": (0, 0)}, "at least 3 panels"),
+        ({"order": (0, 1) * 4}, "has 45 degrees, and these reach 61"),
+    ],
+)
+def test_panels_that_do_not_close_are_refused(how, words):
+    part, _ = ring_part((-10.0, INF), **how)
+    with pytest.raises(InputError, match=re.escape(words)):
+        Panels.of(part, part.others)
+
+
+def test_command_writes_rings(tmp_path, monkeypatch, capsys):
+    """Of equal panels and of two projects, and again where nothing has changed; and what does not go with a ring."""
+    monkeypatch.chdir(tmp_path)
+    write_blob(tmp_path / "blob.png")
+    how = "--base-radius=-10,inf --entrance parallel --relief=-0.4,0 --mag 1.2 --throw 200 --lens-size 10x6 --start transport"
+    few = "--control 16 --resolution 24 --iterations 1 --waves off --quiet"
+    for name, more in (("a", ""), ("b", "--flip x")):
+        assert cli.run(["design", "blob.png", *f"{how} {few} {more} --out {name}.caustic".split()]) == 0
+    capsys.readouterr()
+    order = "b.caustic,a.caustic,b.caustic,a.caustic,b.caustic"
+    for options in ("6 --format ply --samples 9x7", f"{order} --format stl --samples 9x7 --json"):
+        assert cli.run(["export", "a.caustic", "--ring", *options.split()]) == 0
+    said, found = capsys.readouterr().out.split("{", 1)
+    assert "ring of 6 panels of 60 degrees and 9 x 7 points" in said
+    ring = json.loads("{" + found)["ring"]
+    count = int(np.frombuffer((tmp_path / "a.stl").read_bytes()[80:84], "<u4")[0])
+    assert ring["triangles"] == count > 6 * 2 * 2 * 8 * 6  # two sides of 8 x 6 cells, and ends
+    refused = {
+        "6 --format step": "belongs to --format",
+        "6 --format gcode": "--path rotary is needed",
+        "6 --format 3mf --orientation up": "stands on its end",
+        "6 --format stl --mould": "got a mould",
+        "5 --format stl": "has 72 degrees",
+        "none.caustic --format stl": "none.caustic",
+    }
+    for options, words in refused.items():
+        assert cli.run(["export", "a.caustic", "--ring", *options.split()]) == 2
+        assert words in capsys.readouterr().err

@@ -10,7 +10,7 @@ import typer
 
 from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError, alternatives
-from caustic_cli.export import FORMATS, MOST_BYTES, MOULDS, ORIENTATIONS, UNSAMPLED, WITHIN, format_of
+from caustic_cli.export import FORMATS, MOST_BYTES, MOULDS, ORIENTATIONS, RINGS, UNSAMPLED, WITHIN, format_of
 from caustic_cli.export.milling import MILLED, TURNED, TURNING, Milling
 from caustic_cli.schema import checks
 
@@ -33,6 +33,7 @@ TAKERS: dict[str, Sequence[str]] = {
     "script": ("lighttools",),
     "printer": ("3mf",),
     "orientation": ("3mf",),
+    "ring": RINGS,
     "milling": ("gcode",),
 }
 
@@ -95,6 +96,14 @@ class ExportOptions(options.OfDesign, options.Debugging):
             metavar="MM", help="Mirror or mould: least material behind the surface.  [default: a fifth of the larger side]"
         ),
     ] = None
+    ring: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|PROJECT[,PROJECT...]",
+            help="stl, ply, obj, 3mf, gcode with --path rotary: a closed ring of N such panels on the outside of a cylinder, or of"
+            " this one and those of other projects, in their order around its axis.",
+        ),
+    ] = None
     levels: Annotated[
         int | None,
         typer.Option(
@@ -144,6 +153,10 @@ def run(asked: ExportOptions) -> None:
     from caustic_cli.workflow.export import accuracy_words, export, exporter_of  # noqa: PLC0415
 
     exporter, opened = exporter_of(project, asked.at, say, most)
+    if asked.ring is not None:
+        from caustic_cli.workflow.ring import RingExporter  # noqa: PLC0415
+
+        exporter = RingExporter.of(exporter, _ring(asked.ring))
     all_figures = []
     for name in formats:
         own = {option: value for option, value in given.items() if name in TAKERS[option]}
@@ -156,6 +169,8 @@ def run(asked: ExportOptions) -> None:
             say.result(f"{file}: {Path(file).stat().st_size:,} bytes")
         if advice := figures.get(name, {}).get("advice"):
             say.result(advice)
+        if ring := figures.get("ring"):
+            say.result(_ring_words(ring))
         if register := figures.get("register"):
             say.result(_register_words(register))
         if "milling" in figures:
@@ -244,6 +259,26 @@ def _given(asked: ExportOptions, formats: list[str]) -> dict[str, Any]:
         "milling": asked.milling or None,
     }
     return {name: value for name, value in given.items() if value is not None}
+
+
+def _ring(text: str) -> int | list[Path]:
+    """Number of equal panels, or the projects of the others."""
+    if text.strip().isdigit():
+        return int(text)
+    paths = [Path(name.strip()) for name in text.split(",")]
+    for path in paths:
+        options.require_project(path, archives=True)
+    return paths
+
+
+def _ring_words(ring: dict[str, Any]) -> str:
+    """A ring of panels, in a line."""
+    nx, ny = ring["panel_points"]
+    return (
+        f"ring of {ring['panels']} panels of {ring['panel_degrees']:.4g} degrees and {nx} x {ny} points, radius"
+        f" {ring['outer_radius_mm']:.5g} mm, {ring['triangles']:,} triangles, {1e-3 * ring['volume_mm3']:.4g} cm³; steps between"
+        f" panels up to {ring['step_mm']:.3g} mm"
+    )
 
 
 def _register_words(register: dict[str, Any]) -> str:

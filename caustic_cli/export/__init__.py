@@ -26,6 +26,8 @@ MESHES = ("stl", "ply", "obj", "3mf", "mitsuba")
 #: Formats of solids, in which a mirror gets a back; formats in the orientation of machining; and formats that support moulds.
 SOLIDS, AS_CUT = ("step", "stl", "ply", "obj", "3mf"), ("heightmap", "gcode")
 MOULDS = (*SOLIDS, *AS_CUT)
+#: Formats of closed rings of panels.
+RINGS = ("stl", "ply", "obj", "3mf", "gcode")
 #: Formats that hold one surface: of a lens with two free-form sides, both are written side by side.
 SIDE_BY_SIDE = (*AS_CUT, "csv", "xyz", "zemax")
 #: Formats with a tolerance, and formats without samples.

@@ -23,13 +23,15 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.export.part import Part
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Aperture
 
 #: Points along each axis at which slopes and edges are sampled.
 SAMPLES = 401
 #: Most secant iterations along a radius, their tolerance, mm, and the most that their derivative differs from a cylinder's.
 STEPS, STILL, STEEPEST = 30, 1e-10, 4.0
-#: Fewest panels of a ring: each is a height field, of less than half of the way around.
-FEWEST = 3
+#: Fewest panels of a ring: each is a height field, of less than half of the way around; and the most that a panel may be wider than
+#: its sector, which the mitres cut off.
+FEWEST, WIDER = 3, 1.1
 
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Side = tuple[HeightField, Tensor]
@@ -90,6 +92,17 @@ class Cylinder:
         return np.hypot(across, found)
 
 
+def level(side: Side) -> Height:
+    """Heights of a surface, which beyond its edges continues level."""
+    field, heights = side
+
+    def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        at = (torch.from_numpy(np.clip(c, -r, r)) for c, r in zip((x, y), field.half_size, strict=True))
+        return field.at(heights, *at, [(0, 0)])[0].numpy()
+
+    return height
+
+
 @dataclass(frozen=True, eq=False)
 class Panels:
     """Surfaces `sides` of the panels on a cylinder, in their order around it; half: of each along the axis, mm."""
@@ -108,23 +121,25 @@ class Panels:
         cylinder = Cylinder.of(part, asked)
         found = cls(cylinder, ((part.field, part.heights), *others), part.lens.half_size[1 - cylinder.bent])
         if found.closed:
+            if part.lens.aperture != Aperture.name or part.lens.border > 0:
+                raise InputError("⟨ring⟩ is made of rectangular panels without ⟨lens.border⟩")
             found._refuse_open(part.lens.half_size[cylinder.bent])
         return found
 
     def _refuse_open(self, half: float) -> None:
-        """Refuse panels that do not reach the mitres.
+        """Refuse panels that do not reach the mitres, or are cut off there.
 
         Raises:
-            InputError: they leave gaps.
+            InputError: they leave gaps, or their pictures would lack their sides.
         """
         if len(self.sides) < FEWEST:
             raise InputError(f"⟨ring⟩ must have at least {FEWEST} panels, got {len(self.sides)}")
         reach = min(float(angle) for angle in self._edges(half))
-        if reach < self.sector:
-            least = 2.0 * self.high * math.sin(self.sector)
+        if not self.sector <= reach <= WIDER * self.sector:
+            fitting = 2.0 * self.high * math.sin(self.sector)
             raise InputError(
-                f"⟨ring⟩ of {len(self.sides)} panels: they reach {2.0 * math.degrees(reach):.4g} degrees around the axis each, not"
-                f" {2.0 * math.degrees(self.sector):g}; a ⟨lens.size⟩ of {least:.6g} mm across does"
+                f"⟨ring⟩ of {len(self.sides)} panels: each has {2.0 * math.degrees(self.sector):.4g} degrees, and these reach"
+                f" {2.0 * math.degrees(reach):.4g} around the axis; a ⟨lens.size⟩ of {fitting:.6g} mm across fits"
             )
 
     def _edges(self, half: float) -> list[float]:
@@ -136,6 +151,11 @@ class Panels:
                 z = field.at(heights, x, y, [(0, 0)])[0].numpy()
                 found.append(float(np.abs(np.arctan2(end, z - self.cylinder.axis)).min()))
         return found
+
+    def distances(self, height: Height, theta: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """Distances from the axis, mm, at which radii at angles (n,) from a vertex and places (m,) meet a surface: (n, m)."""
+        turns, places = (c.ravel() for c in np.meshgrid(theta, along, indexing="ij"))
+        return self.cylinder.distance(height, places, turns, self.cylinder.radius).reshape(len(theta), len(along))
 
     @property
     def closed(self) -> bool:

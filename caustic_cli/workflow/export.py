@@ -60,6 +60,11 @@ class Exporter:
         self.scene, self.field, self.heights, self.target = scene, field, heights, target
         self.waves, self.seed, self.most, self.say = waves, seed, most, say or Listener()
 
+    @property
+    def asked(self) -> dict:
+        """What determines its files beside the project, the format and their options."""
+        return {"most": self.most} if self.most != MOST_BYTES else {}
+
     @cached_property
     def picture(self) -> PictureError:
         """The error of the lens' own picture, and of others."""
@@ -93,8 +98,8 @@ class Exporter:
         if format == "gcode":
             found, *back = (home.write_gcode(p, s, with_stock(m, s), **given) for p, s in zip(paths, sides, strict=True))
             entrance = {"entrance": back[0]} if back else {}
-            return {"milling": found | _scallops(scene, self.field, found)} | entrance | registered(sides)
-        each = [_file(format, p, s) for p, s in zip(paths, sides, strict=True)]
+            return {"milling": found | scallops_of(scene, self.field, found)} | entrance | registered(sides)
+        each = [file_of(format, p, s) for p, s in zip(paths, sides, strict=True)]
         file = each[0] if len(sides) == 1 else BothSides(**vars(each[0]), other=each[1], scene=scene)
         judged = hasattr(home, "readings")
         more = {key: given.pop(key) for key in getattr(home, "MORE", ()) if key in given}
@@ -172,7 +177,7 @@ class Exporter:
         if not EXPORT[format].supports(self.scene):
             return False
         part = part_of(format, self.scene, self.field, self.heights)
-        file = _file(format, Path(f"lens{FORMATS[format][0]}"), part)
+        file = file_of(format, Path(f"lens{FORMATS[format][0]}"), part)
         return self.error(file, file.choices(MOST_BYTES)[-1], "error") <= self.picture.largest
 
 
@@ -280,7 +285,7 @@ def export(
     printer = finishing.printer(opened.settings.lens.finish)
     if printer is not None and "printer" in getattr(_home(format), "MORE", ()):
         given = {"printer": printer} | given
-    values = ({"at": at} if at is not None else {}) | ({"most": exporter.most} if exporter.most != MOST_BYTES else {})
+    values = ({"at": at} if at is not None else {}) | exporter.asked
     made = Outputs(opened, "export", {"format": format, "script": script, **values, **given}, written)
     if not force and (found := made.found()):
         exporter.say.say(
@@ -346,7 +351,8 @@ def accuracy_words(figures: dict) -> str:
     return f"{text}; warning: this file does not keep the picture; {kept}"
 
 
-def _file(format: str, path: Path, part: Part) -> File:
+def file_of(format: str, path: Path, part: Part) -> File:
+    """The file of a part in a format."""
     return File(_home(format), _arguments(format, part), path if format == "heightmap" else None, part)
 
 
@@ -363,7 +369,7 @@ def _length(length: float) -> str:
     return f"{1e3 * length:.2g} µm" if length >= 1e-6 else "a nanometre"
 
 
-def _scallops(scene: Scene, field: HeightField, found: dict) -> dict:
+def scallops_of(scene: Scene, field: HeightField, found: dict) -> dict:
     """Optical effect of the scallops: see `studies.scallops`."""
     return import_module("caustic_cli.studies.scallops").scallops(scene, found["step_over_mm"], found["tool_radius_mm"])
 

@@ -45,7 +45,9 @@ def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float
             raise InputError(f"{path}: does not give the radius of its ball-nose tool; ⟨tool_radius⟩ is needed")
         if program.rotary is not None:
             centres = _around(cut.tips, radius, *program.rotary)
-            envelopes.append(Envelope(radius, centres[:-1], centres[1:]))
+            before = centres[:, 2] > program.rotary[1]  # not behind the axis, where a ring has other panels
+            before = before[:-1] & before[1:]
+            envelopes.append(Envelope(radius, centres[:-1][before], centres[1:][before]))
             continue
         if cut.kind == LATHE:
             envelopes.append(NoseEnvelope(radius, cut.tips))

@@ -15,10 +15,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 
 from caustic_cli.export.milling.offset import BallOffset, dilated, steps_of
-from caustic_cli.export.panels import Panels, Side
+from caustic_cli.export.panels import Panels, level
 
 
 def _wrapped(theta: np.ndarray) -> np.ndarray:
@@ -67,7 +66,7 @@ class RadialFlat:
         self.first, self.step = -turn, np.array([2.0 * turn / rows, 2.0 * panels.half / columns])
         theta = np.linspace(-turn, turn, rows + 1)[: rows if panels.closed else rows + 1]
         along = np.linspace(-panels.half, panels.half, columns + 1)
-        maps = {id(side[1]): self._map(side, theta, along) for side in panels.unlike}
+        maps = {id(side[1]): panels.distances(level(side), theta, along) for side in panels.unlike}
         rho = np.concatenate([maps[id(side[1])] for side in panels.sides])
         self.rows, low, half = len(rho), float(rho.min()), 0.5 * math.hypot(float(rho.max()) * self.step[0], self.step[1])
         # the nearest sample of a point under the tool, on its own side of a mitre, and its axis in a cell
@@ -81,17 +80,6 @@ class RadialFlat:
         lean = np.cos(np.maximum(0.0, turns - 2.0 * self.step[0]))
         self.highest = dilated(rho, chords.astype(int).tolist(), lean.tolist())
         self.more = 2.0 * half * panels.slope + allowance
-
-    def _map(self, side: Side, theta: np.ndarray, along: np.ndarray) -> np.ndarray:
-        """Distances from the axis, mm, at the angles and lengths, (n, m); beyond its edges a panel continues level."""
-        (field, heights), cylinder = side, self.panels.cylinder
-
-        def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-            at = (torch.from_numpy(np.clip(c, -r, r)) for c, r in zip((x, y), field.half_size, strict=True))
-            return field.at(heights, *at, [(0, 0)])[0].numpy()
-
-        turns, places = (c.ravel() for c in np.meshgrid(theta, along, indexing="ij"))
-        return cylinder.distance(height, places, turns, cylinder.radius).reshape(len(theta), len(along))
 
     def __call__(self, along: np.ndarray, s: np.ndarray) -> np.ndarray:
         """As of `RadialBall`."""
