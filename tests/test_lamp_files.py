@@ -214,8 +214,8 @@ class InItsPlace:
         self.shapes_in = re.findall(r'id="(\w+)"', Path(path).read_text())
         return SimpleNamespace(shapes=list)
 
-    def follow(self, _mi, _world, _shapes, surfaces, start, direction):
-        assert {name for name, _ in surfaces} <= set(self.shapes_in)
+    def follow(self, _mi, _world, _shapes, surfaces, start, direction, _rng):
+        assert {one.name for one in surfaces} <= set(self.shapes_in)
         count = start.shape[1]
         rays = ChipRays(
             tuple(torch.from_numpy(c) for c in start), tuple(torch.from_numpy(c) for c in direction), torch.ones(count).double()

@@ -294,7 +294,6 @@ def test_a_design_of_round_lenslets(arrays, monkeypatch):
         ("design blob.png --array 4x9 --packing hexagonal", "hexagonally packed rows"),
         ("design blob.png --array 2 --packing triangular", "hexagonal"),
         ("export round.caustic --format lighttools --script", "opaque mask"),
-        ("render round.caustic --html page.html", "opaque mask"),
     ],
 )
 def test_refusals(line, said, arrays, monkeypatch, capfd):

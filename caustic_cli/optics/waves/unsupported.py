@@ -31,10 +31,12 @@ _ASKED = Capability.because(
     {
         "it takes a wave image of each of several sources": ("several sources",),
         "behind the creases of a free-form entrance light has no single wavefront": ("two sides",),
-        "it takes many samples, or a part of the light": ("other elements",),
+        "behind other elements it takes many samples, or a part of the light": ("other elements",),
         "light of lenslets side by side interferes in fine fringes, which rays alone pass over": ("lenslet array",),
-        "it takes many transforms for each wavelength": ("tilted screen", "curved screen"),
-        "it holds for surfaces that are smooth over the Fresnel scale of their depth along the light": ("tilted light",),
+        "on a tilted or curved screen it takes many transforms for each wavelength": ("tilted screen", "curved screen"),
+        "in tilted light it holds for surfaces that are smooth over the Fresnel scale of their depth along the light": (
+            "tilted light",
+        ),
     },
     "{reason}; ⟨waves⟩ on refines it all the same",
 )
