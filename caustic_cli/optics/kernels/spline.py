@@ -182,6 +182,30 @@ def evaluate(block, u, v, c, pieces, z, zx, zy, blocks):
 
 
 @njit(entry=True, **FAST)
+def evaluate_net(block, u, v, net, linear, pieces, z, zx, zy, blocks):
+    """`evaluate` from the control heights (n, m) themselves, with the polynomial of one piece at a time."""
+    if on_threads(block, blocks, (u, v, net, linear, pieces, z, zx, zy, blocks)):
+        return
+    (fu, tu, fv, tv), count = linear, len(u)
+    p, q = tu.shape[1], tv.shape[1]
+    c, rows = np.empty((1, 1, p, q)), np.empty((p, q))
+    for k in range(block * count // blocks, (block + 1) * count // blocks):
+        i, j, xi, eta = place(u[k], v[k], pieces)
+        for a in range(p):
+            for b in range(q):
+                rows[a, b] = 0.0
+                for n in range(q):
+                    rows[a, b] += tv[j, b, n] * net[fu[i] + a, fv[j] + n]
+        for a in range(p):
+            for b in range(q):
+                c[0, 0, a, b] = 0.0
+                for n in range(p):
+                    c[0, 0, a, b] += tu[i, a, n] * rows[n, b]
+        value, along, across, _, _, _ = jet(c, 0, 0, xi, eta)
+        z[k], zx[k], zy[k] = value, along * pieces.over_u[i] * pieces.scale_x, across * pieces.over_v[j] * pieces.scale_y
+
+
+@njit(entry=True, **FAST)
 def pull_back(block, u, v, gz, gx, gy, pieces, grads):
     """Adjoint of `evaluate`: derivatives by the coefficients into grads (blocks, I, J, p + 1, q + 1), overwritten."""
     count, blocks = len(u), len(grads)

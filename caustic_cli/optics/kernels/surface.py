@@ -47,7 +47,10 @@ class FusedSurface:
     def evaluate(self, heights: np.ndarray, u: np.ndarray, v: np.ndarray) -> list[np.ndarray]:
         """z mm, dz/dx and dz/dy at points in [0, 1]^2, all (N,) float64."""
         found = [np.empty(len(u)) for _ in range(3)]
-        spline.evaluate(ALL, u, v, self.coefficients(torch.from_numpy(heights)), self.pieces, *found, blocks())
+        if len(u) < math.prod(self._coefficients()[:2]):  # the coefficients of all pieces take longer, and much memory
+            spline.evaluate_net(ALL, u, v, heights, self.linear, self.pieces, *found, blocks())
+        else:
+            spline.evaluate(ALL, u, v, self.coefficients(torch.from_numpy(heights)), self.pieces, *found, blocks())
         return found
 
     def pull_at(self, u: np.ndarray, v: np.ndarray, *by: np.ndarray) -> np.ndarray:
