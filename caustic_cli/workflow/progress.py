@@ -56,12 +56,13 @@ class Watch:
         now.accuracy = list(self.cost.measure(now.total, now, always))
 
     def reaches(self, aim: Aim | None) -> bool:
-        """Whether the lens has at most this error, which is measured anew where the loss says that it may."""
+        """Whether the lens has at most this error, which is measured anew where the loss says that it may, or is another's."""
         now = self.now
         if aim is None or not now.accuracy:
             return False
-        last, losses = now.accuracy[-1], {0: math.inf} | {row[0]: row[2] for row in now.history}
-        if last.iteration < now.total and last.error * losses[now.total] <= aim.error * losses[last.iteration]:
+        last, losses = now.accuracy[-1], {row[0]: row[2] for row in now.history if row[1] == now.stage}
+        before = losses.get(last.iteration, math.inf)
+        if last.iteration < now.total and last.error * losses.get(now.total, 0.0) <= aim.error * before:
             self.measure(now, always=True)
         return now.accuracy[-1].iteration == now.total and now.accuracy[-1].error <= aim.error
 
@@ -84,18 +85,19 @@ class Watch:
         self.now = now
         stages, stage = self.designer.stages, self.designer.stages[now.stage]
         name = f"stage {now.stage + 1}/{len(stages)}"
-        if now.stage != self.stage:
+        begins = now.stage != self.stage
+        if begins:
             self.stage = now.stage
             self.say.say(f"{name}: {stage.control[0]} x {stage.control[1]} control points, {stage.light}")
         _, _, loss, on_screen, _ = now.history[-1]
         self.show(name, f"loss {loss * grey(self.target).size:.4f}  on screen {on_screen:.1%}", now.total, self.total)
         self.movie.record(now, self.target, self.encoding, bool(stage.waves))
-        self.measure_if_due(now)
+        self.measure_if_due(now, begins)
         self.keep_if_due(now)
 
-    def measure_if_due(self, now: State) -> None:
-        """Measure the error of the lens if this iteration is one of those planned."""
-        if now.total in self.cost.due:
+    def measure_if_due(self, now: State, begins: bool = False) -> None:
+        """Measure the error of the lens if this iteration is one of those planned, or the first of a stage."""
+        if begins or now.total in self.cost.due:
             self.measure(now)
 
     def keep_if_due(self, now: State) -> None:
