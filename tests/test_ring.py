@@ -257,6 +257,8 @@ def test_command_writes_rings(tmp_path, monkeypatch, capsys):
         "6 --format 3mf --orientation up": "stands on its end",
         "6 --format stl --mould": "got a mould",
         "5 --format stl": "has 72 degrees",
+        "1 --format stl": "at least 3 panels",
+        "100000000 --format stl": "at most 360",
         "none.caustic --format stl": "none.caustic",
     }
     for options, words in refused.items():

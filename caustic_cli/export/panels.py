@@ -32,13 +32,15 @@ STEPS, STILL, STEEPEST = 30, 1e-10, 4.0
 #: Fewest panels of a ring: each is a height field, of less than half of the way around; and the most that a panel may be wider than
 #: its sector, which the mitres cut off.
 FEWEST, WIDER = 3, 1.1
+#: Most panels, of a degree each.
+MOST = 360
 
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Side = tuple[HeightField, Tensor]
 
 
 @dataclass(frozen=True)
-class Cylinder:
+class BaseCylinder:
     """A base cylinder: the coordinate with curvature, 0 for x, 1 for y; R_0 and z_a, mm."""
 
     bent: int
@@ -46,7 +48,7 @@ class Cylinder:
     axis: float
 
     @classmethod
-    def of(cls, part: Part, asked: str) -> Cylinder:
+    def of(cls, part: Part, asked: str) -> BaseCylinder:
         """That of a part; asked: what needs it.
 
         Raises:
@@ -92,6 +94,16 @@ class Cylinder:
         return np.hypot(across, found)
 
 
+def refuse_number(panels: int) -> None:
+    """Refuse a ring of this number of panels.
+
+    Raises:
+        InputError: they are too few or too many.
+    """
+    if not FEWEST <= panels <= MOST:
+        raise InputError(f"⟨ring⟩ must have at least {FEWEST} panels and at most {MOST}, got {panels}")
+
+
 def level(side: Side) -> Height:
     """Heights of a surface, which beyond its edges continues level."""
     field, heights = side
@@ -107,7 +119,7 @@ def level(side: Side) -> Height:
 class Panels:
     """Surfaces `sides` of the panels on a cylinder, in their order around it; half: of each along the axis, mm."""
 
-    cylinder: Cylinder
+    cylinder: BaseCylinder
     sides: tuple[Side, ...]
     half: float
 
@@ -118,7 +130,7 @@ class Panels:
         Raises:
             InputError: it is not on the outside of a cylinder, or the panels do not close.
         """
-        cylinder = Cylinder.of(part, asked)
+        cylinder = BaseCylinder.of(part, asked)
         found = cls(cylinder, ((part.field, part.heights), *others), part.lens.half_size[1 - cylinder.bent])
         if found.closed:
             if part.lens.aperture != Aperture.name or part.lens.border > 0:
@@ -132,8 +144,7 @@ class Panels:
         Raises:
             InputError: they leave gaps, or their pictures would lack their sides.
         """
-        if len(self.sides) < FEWEST:
-            raise InputError(f"⟨ring⟩ must have at least {FEWEST} panels, got {len(self.sides)}")
+        refuse_number(len(self.sides))
         reach = min(float(angle) for angle in self._edges(half))
         if not self.sector <= reach <= WIDER * self.sector:
             fitting = 2.0 * self.high * math.sin(self.sector)
@@ -145,7 +156,7 @@ class Panels:
     def _edges(self, half: float) -> list[float]:
         """Least angle of each panel's two edges at +-half mm across."""
         along, found = np.linspace(-self.half, self.half, SAMPLES), []
-        for field, heights in self.sides:
+        for field, heights in self.unlike:
             for end in (-half, half):
                 x, y = map(torch.from_numpy, self.cylinder.lens_xy(along, np.full(SAMPLES, end)))
                 z = field.at(heights, x, y, [(0, 0)])[0].numpy()

@@ -18,10 +18,10 @@ from caustic_cli.optics.surfaces.polarfield import PolarField
 from caustic_cli.scene.lamp import Chip, Goal, Lamp
 from caustic_cli.studies.lamp import lamp_image
 from caustic_cli.studies.retrace import BATCHES
-from caustic_cli.studies.verify import TURN, Agreement, Surface, choose_variant, compare, follow
+from caustic_cli.studies.verify import TURN, Agreement, SceneSurface, choose_variant, compare, follow
 
 #: Surfaces in the order of light, and rays traced at a time.
-SURFACES, CHUNK = [Surface(name, False, 0.0) for name in ("inner", "outer", "screen")], 1 << 20
+SURFACES, CHUNK = [SceneSurface(name, False, 0.0) for name in ("inner", "outer", "screen")], 1 << 20
 
 
 def verify_lamp(

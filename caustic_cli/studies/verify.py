@@ -151,7 +151,7 @@ def choose_variant() -> str:
 # tracing
 
 
-class Surface(NamedTuple):
+class SceneSurface(NamedTuple):
     """A surface in the order of light: its name in the exported scene, whether it reflects, and the absorption of the medium in
     front of it, 1/mm."""
 
@@ -168,7 +168,7 @@ def _trace(mi, world, scene: Scene, rays: int, seed: list[int]) -> tuple[np.ndar
     system = System.of(scene)
     receiver, own = Receiver.of(system, scene.screen), {EXIT: "mirror"} if scene.lens.mirror else {}  # the export's name of it
     elements = [*((own.get(e.name, e.name), e.reflects) for e in system.elements), ("screen", False)]
-    surfaces = [Surface(*e, m.absorption) for e, m in zip(elements, system.media(), strict=True)]
+    surfaces = [SceneSurface(*e, m.absorption) for e, m in zip(elements, system.media(), strict=True)]
     for start, direction, share in sample_rays(scene, rays, rng):
         *points, weight = follow(mi, world, shapes, surfaces, start, direction, rng)
         x, y = receiver.shape.coordinates(np.array(points, np.float64), receiver.middle, receiver.axes)
@@ -177,7 +177,7 @@ def _trace(mi, world, scene: Scene, rays: int, seed: list[int]) -> tuple[np.ndar
     return image / rays, squares / rays**2
 
 
-def follow(mi, world, shapes, surfaces: list[Surface], start: np.ndarray, direction: np.ndarray, rng: np.random.Generator):
+def follow(mi, world, shapes, surfaces: list[SceneSurface], start: np.ndarray, direction: np.ndarray, rng: np.random.Generator):
     """Landing points x, y, z (mm) and weights of all rays through this sequence of surfaces; weight 0 where lost.
 
     Args:
@@ -188,7 +188,7 @@ def follow(mi, world, shapes, surfaces: list[Surface], start: np.ndarray, direct
     return (_follow if "scalar" not in mi.variant() else _follow_scalar)(mi, world, shapes, surfaces, start, direction, rng)
 
 
-def _follow(mi, world, shapes, surfaces: list[Surface], start: np.ndarray, direction: np.ndarray, rng: np.random.Generator):
+def _follow(mi, world, shapes, surfaces: list[SceneSurface], start: np.ndarray, direction: np.ndarray, rng: np.random.Generator):
     """The same, all rays at a time."""
     ray = mi.Ray3f(mi.Point3f(*map(mi.Float, start)), mi.Vector3f(*map(mi.Float, direction)))
     weight, active = mi.Float(1.0), mi.Bool(True)
@@ -204,7 +204,9 @@ def _follow(mi, world, shapes, surfaces: list[Surface], start: np.ndarray, direc
     return *(np.array(c) for c in (hit.p.x, hit.p.y, hit.p.z)), np.where(np.array(active), np.array(weight), 0.0)
 
 
-def _follow_scalar(mi, world, _shapes, surfaces: list[Surface], start: np.ndarray, direction: np.ndarray, rng: np.random.Generator):
+def _follow_scalar(
+    mi, world, _shapes, surfaces: list[SceneSurface], start: np.ndarray, direction: np.ndarray, rng: np.random.Generator
+):
     """The same, ray by ray."""
     out = np.zeros((4, start.shape[1]))
     for k in range(start.shape[1]):

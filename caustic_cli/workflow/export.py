@@ -124,13 +124,14 @@ class Exporter:
             file.errors[which] = self.picture.through(*file.in_the_scene(reading), reading.entrance)
         return file.errors[which]
 
-    def smallest(self, file: File) -> dict:
-        """The smallest choice that keeps the picture, or else the one with the least error of those tried.
+    def smallest(self, file: File, parts: int = 1) -> dict:
+        """The smallest choice that keeps the picture, or else the one with the least error of those tried; parts: of such files,
+        by which the largest size is divided.
 
         The error falls with the size of the file, but for rounding: the choices are tried upwards or downwards from that with every
         knot on a grid line.
         """
-        choices, errors = file.choices(self.most), dict[int, float]()
+        choices, errors = file.choices(self.most / parts), dict[int, float]()
 
         def error(k: int) -> float:
             if k not in errors:

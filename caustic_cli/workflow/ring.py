@@ -12,7 +12,7 @@ from caustic_cli.errors import InputError, alternatives
 from caustic_cli.export import FORMATS, RINGS
 from caustic_cli.export.milling import ROTARY, Milling
 from caustic_cli.export.milling.gcode import write_gcode
-from caustic_cli.export.panels import Panels, Side
+from caustic_cli.export.panels import Panels, Side, refuse_number
 from caustic_cli.export.part import part_of
 from caustic_cli.export.ring import figures, ring_of
 from caustic_cli.export.supported import refuse
@@ -30,8 +30,9 @@ class RingExporter(Exporter):
         """Of a number of equal panels, or of the projects of the others in their order around the axis.
 
         Raises:
-            InputError: a project has no lens, or is on another base.
+            InputError: there are too few or too many, a project has no lens, or is on another base.
         """
+        refuse_number(ring if isinstance(ring, int) else len(ring) + 1)
         found = cls(first.scene, first.field, first.heights, first.target, first.waves, first.seed, first.most, first.say)
         own = (first.field, first.heights.detach().double().cpu())
         if isinstance(ring, int):
@@ -86,9 +87,8 @@ class RingExporter(Exporter):
             made = write_gcode(path, part, m, **given)
             return {"milling": made | scallops_of(scene, self.field, made)}
         panels = Panels.of(part, self.others)
-        most, self.most = self.most, self.most / len(panels.sides)  # of one panel
-        choice = given if {"samples", "tolerance"} & set(given) else self.smallest(file_of(format, path, part))
-        self.most = most
+        chosen = {"samples", "tolerance"} & set(given)
+        choice = given if chosen else self.smallest(file_of(format, path, part), len(panels.sides))
         ring = ring_of(panels, part.lens, **choice)
         import_module(f"caustic_cli.export.{FORMATS[format][1]}").write_mesh(path, ring.vertices, ring.faces)
         return {"ring": figures(panels, ring)}

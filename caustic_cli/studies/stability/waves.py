@@ -17,7 +17,7 @@ TURN = 2.0 * math.pi
 
 
 def long_path(millimetres: float) -> tuple[float, float]:
-    """Phase of paths of about this length, which are reduced to one turn before it rounds them, rad."""
+    """Phase of paths of about this length, which are reduced to one turn before they are rounded, rad."""
     region = (-1.0, -1.0), (1.0, 1.0)
     sampling = Sampling.of(region, region, (0.1, 0.1), millimetres, (LENGTH,))
     n = sampling.count
