@@ -23,7 +23,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -264,24 +265,26 @@ def heights(
     """
     step = float(x[1, 0] - x[0, 0]), float(y[0, 1] - y[0, 0])
     scale = 1.0 / ((index - 1.0) * (z_screen - mean) if projection is None else projection.gain(index))
-    if projection is None:
-        main = scale * (map_.potential - 0.5 * (x * x + y * y))
-        slope = scale * (map_.x - x), scale * (map_.y - y)
-    else:
-        cx, cy = projection.axial_scale
-        main = scale * (projection.sign * map_.potential - 0.5 * (cx * x * x + cy * y * y))
-        slope = scale * (projection.sign * map_.x - cx * x), scale * (projection.sign * map_.y - cy * y)
+    sign, (cx, cy) = (1.0, (1.0, 1.0)) if projection is None else (projection.sign, projection.axial_scale)
+    main = (scale * sign) * map_.potential
+    main -= (0.5 * scale) * (cx * x * x + cy * y * y)
     z = main - main.mean() + mean
     towards = None if projection is None else projection.directions_to(*aim)
-    within, rest, moved = np.empty(z.shape, bool), np.empty((2, *z.shape)), 0.0
+    within, rest = np.empty(z.shape, bool), np.empty((2, *z.shape))
+
+    def remainder(rows: slice) -> None:
+        """The slopes there beyond those of `main`."""
+        to = tuple(c[rows] for c in ahead) if ahead else (aim[0][rows] - x[rows], aim[1][rows] - y, z_screen - z[rows])
+        light = tuple(v[rows] if isinstance(v, np.ndarray) else v for v in d)
+        within[rows] = turned = refracted(*to, light, index)
+        slope = scale * (sign * map_.x[rows] - cx * x[rows]), scale * (sign * map_.y[rows] - cy * y)
+        for w, s, out in zip(slopes_to(*to, light, index), slope, rest, strict=True):
+            out[rows] = np.where(turned, w - s, 0.0)
+
+    moved = 0.0
     for _ in range(REPEATS):
         ahead = towards(x, y, z) if towards else None
-        for rows in _strips(len(z), ROWS):
-            to = tuple(c[rows] for c in ahead) if ahead else (aim[0][rows] - x[rows], aim[1][rows] - y, z_screen - z[rows])
-            light = tuple(v[rows] if isinstance(v, np.ndarray) else v for v in d)
-            within[rows] = turned = refracted(*to, light, index)
-            for w, s, out in zip(slopes_to(*to, light, index), slope, rest, strict=True):
-                out[rows] = np.where(turned, w - s[rows], 0.0)
+        _each_strip(len(z), remainder)
         if not within[lit].all():
             raise OutOfReach(lit & ~within)
         before, z = z, main + integrate(*rest, step)
@@ -292,9 +295,11 @@ def heights(
     return z
 
 
-def _strips(n: int, rows: int) -> Iterator[slice]:
-    """Slices of n rows, `rows` at a time."""
-    return (slice(k, k + rows) for k in range(0, n, rows))
+def _each_strip(n: int, work: Callable[[slice], object]) -> None:
+    """Call it with slices of n rows, ROWS at a time, on torch's number of threads."""
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for _ in pool.map(work, (slice(k, min(k + ROWS, n)) for k in range(0, n, ROWS))):
+            pass
 
 
 def refracted(tx, ty, tz, d, index: float) -> np.ndarray:
@@ -318,8 +323,8 @@ def slopes_to(tx, ty, tz, d, index: float) -> tuple[np.ndarray, np.ndarray]:
 def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.ndarray:
     """Least-squares integration of slopes: the surface (n, m) of mean 0 whose differences are closest to the slopes at its
     points."""
-    right = _divergence(sx, step[0])
-    right += _divergence(sy.T, step[1]).T
+    right = np.empty_like(sx)
+    _each_strip(len(sx), lambda rows: _divergence(sx, sy, step, rows, right))
     wave = [(2.0 / h * np.sin(0.5 * np.pi * np.arange(n) / (n - 1))) ** 2 for n, h in zip(sx.shape, step, strict=True)]
     workers = torch.get_num_threads()
     spectrum = dctn(right, type=1, workers=workers, overwrite_x=True)
@@ -331,14 +336,19 @@ def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.n
     return z
 
 
-def _divergence(slopes: np.ndarray, step: float) -> np.ndarray:
-    """Divergence along the first axis of slopes (n, m), with natural (Neumann) boundary conditions: border points have half a
-    cell."""
-    out = np.empty_like(slopes)
-    mean = (0.5 / step) * (slopes[1:] + slopes[:-1])
-    np.subtract(mean[1:], mean[:-1], out=out[1:-1])
-    out[0], out[-1] = 2.0 * mean[0], -2.0 * mean[-1]
-    return out
+def _divergence(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float], rows: slice, out: np.ndarray) -> None:
+    """Divergence of slopes (n, m) in these rows, with natural (Neumann) boundary conditions: border points have half a cell."""
+    first, last, n = rows.start, rows.stop, len(sx)
+    ahead, back = (np.arange(first, last) + k for k in (1, -1))
+    out[rows] = (0.5 / step[0]) * (sx[np.minimum(ahead, n - 1)] - sx[np.maximum(back, 0)])
+    if first == 0:
+        out[0] = (sx[0] + sx[1]) / step[0]
+    if last == n:
+        out[-1] = -(sx[-1] + sx[-2]) / step[0]
+    along, here = sy[rows], out[rows]
+    here[:, 1:-1] += (0.5 / step[1]) * (along[:, 2:] - along[:, :-2])
+    here[:, 0] += (along[:, 0] + along[:, 1]) / step[1]
+    here[:, -1] -= (along[:, -1] + along[:, -2]) / step[1]
 
 
 def land(
