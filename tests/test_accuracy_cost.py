@@ -7,6 +7,9 @@ import pytest
 from caustic_cli import cli
 from caustic_cli.inverse import accuracy_cost
 from caustic_cli.inverse.accuracy_cost import CostOfAccuracy, Row, Start, iterations_to_measure, price, seconds_to
+from caustic_cli.inverse.designer import Designer
+from caustic_cli.kinds import problem_of
+from caustic_cli.project.project import Project
 
 
 @pytest.mark.parametrize("total", [1, 2, 5, 7, 8, 12, 40, 92, 1000])
@@ -86,3 +89,30 @@ def test_a_design_keeps_its_curve(tmp_path, capsys):
     resumed = figures_of("--resume", str(out), "--iterations", "40")
     assert resumed["accuracy_cost"][: len(rows)] == rows
     assert resumed["accuracy_cost"][-1]["iteration"] == resumed["iterations"]
+
+
+def test_a_lens_is_traced_once(tmp_path, capsys):
+    """The image by the same rays is kept, and none of it for another lens or for a net that has changed in place since."""
+    out = tmp_path / "a.caustic"
+    command = "design examples/flame.png --resolution 32 --waves off --control 35 --iterations 1 -q -o"
+    assert cli.run([*command.split(), str(out)]) == 0
+    project = Project.open(out)
+    problem = problem_of(project)
+    designer, state = Designer(problem), project.load().state
+    how = 40_000, problem.options.seed
+    before = problem.errors(designer, state, *how, noise=False)[0]["relative_rms"]
+    image = problem.traced(state.heights.clone(), *how)
+    assert image is not None
+    assert problem.traced(state.heights + 1e-9, *how) is None and problem.traced(state.heights, 10, how[1]) is None
+    state.heights *= 0.5
+    assert problem.traced(state.heights, *how) is None
+    assert problem.errors(designer, state, *how, noise=False)[0]["relative_rms"] != before
+
+
+def test_the_curve_ends_with_the_verdict(tmp_path, capsys):
+    """By rays the first and the last row are those of the start and of the lens that is kept."""
+    command = "design examples/flame.png --resolution 32 --waves off --control 35 --iterations 2 --json -q -o"
+    assert cli.run([*command.split(), str(tmp_path / "a.caustic")]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    rows = figures["accuracy_cost"]
+    assert (rows[0]["error"], rows[-1]["error"]) == (figures["start_relative_rms"], figures["relative_rms"])

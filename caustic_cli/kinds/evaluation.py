@@ -6,6 +6,7 @@ The loss of the optimiser does not qualify: it overfits its own rays and reconst
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -67,10 +68,20 @@ class Seen(NamedTuple):
 
 
 class LensEvaluation:
-    """Figures of a finished lens, and the lens that is kept; see `OneSurface.evaluate`."""
+    """Figures of a finished lens, and the lens that is kept; see `OneSurface.evaluate`.
 
-    def __init__(self, designer: Designer, state: State, size: tuple[float, float], timed: bool):
-        self.problem, self.designer, self.state, self.timed = designer.problem, designer, state, timed
+    traced: the image of a lens (n, m) mm by this number of rays and this seed where it has been traced, else None.
+    """
+
+    def __init__(
+        self,
+        designer: Designer,
+        state: State,
+        size: tuple[float, float],
+        timed: bool,
+        traced: Callable[[Tensor, int, int], Image | None],
+    ):
+        self.problem, self.designer, self.state, self.timed, self.traced = designer.problem, designer, state, timed, traced
         self.count = evaluation_rays(designer.scene, self.problem.effort.final_rays)
         self.field = designer.field(state.stage)
         self.refined = any(s.waves for s in designer.stages[: state.stage + 1])
@@ -81,13 +92,14 @@ class LensEvaluation:
 
     def rays(self, heights: Tensor, noise: bool = True) -> tuple[Image, dict[str, Any]]:
         """Image and figures by independent rays."""
-        scene = self.problem.scene
+        scene, seed = self.problem.scene, self.problem.options.seed
         return retrace(
             *trace_arguments(scene, self.field, heights),
             self.target,
             rays=self.count,
             device=self.problem.device,
-            seed=self.problem.options.seed,
+            seed=seed,
+            known=self.traced(heights, self.count, seed),
             noise=noise,
             quiet=None if self.timed else self.problem.effort.noise,
         )

@@ -50,6 +50,7 @@ from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.evaluation import Evaluated, LensEvaluation
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.emission.measured import coarse_words
+from caustic_cli.optics.image import Image
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
@@ -129,6 +130,8 @@ class OneSurface(Problem):
     _ahead: Ahead | None = None
     #: The stage on the wave image that runs, or the last that did, and its objective.
     _refining: tuple[int, ref[LossOfHeights]] | None = None
+    #: The first and the last lens that `errors` traced: heights, their version, (rays, seed), and the image.
+    _traced: tuple[tuple[Tensor, int, tuple[int, int], Image], ...] = ()
 
     # Settings
 
@@ -515,7 +518,7 @@ class OneSurface(Problem):
             size: width and height of the picture, mm; timed: under a time limit, do not increase the number of rays, and limit the
                 iterations for the least error.
         """
-        evaluation = LensEvaluation(designer, state, size, timed)
+        evaluation = LensEvaluation(designer, state, size, timed, self.traced)
         if self.one_scene:
             evaluation.compare_with_start()
         evaluation.compare_unrounded()
@@ -538,8 +541,18 @@ class OneSurface(Problem):
         Raises:
             CausticError: no light reaches the screen.
         """
-        traced = trace_arguments(self.scene, designer.field(state.stage), state.heights)
-        return [retrace(*traced, self.target.numpy(), rays=rays, seed=seed, device=self.device, noise=noise)[1]]
+        lens, how = trace_arguments(self.scene, designer.field(state.stage), state.heights), (rays, seed)
+        known = self.traced(state.heights, *how)
+        image, figures = retrace(*lens, self.target.numpy(), rays=rays, seed=seed, device=self.device, noise=noise, known=known)
+        self._traced = (*self._traced[:1], (state.heights, state.heights._version, how, image))
+        return [figures]
+
+    def traced(self, heights: Tensor, rays: int, seed: int) -> Image | None:
+        """The image of a lens that `errors` traced with these rays, of the first and the last; None of others."""
+        for net, version, how, image in self._traced:
+            if how == (rays, seed) and net._version == version and net.device == heights.device and torch.equal(net, heights):
+                return image
+        return None
 
     def error_of(self, designer: Designer, state: State) -> float | None:
         """Error of a lens by light that the optimiser does not use, as `evaluate` judges it but faster: of the wave image if that

@@ -166,6 +166,7 @@ def retrace(
     requests: Requests = NO_REQUESTS,
     noise: bool = True,
     quiet: float | None = None,
+    known: Image | None = None,
 ) -> tuple[Image, dict]:
     """Trace a lens with independent rays; with `tolerance`, as many as it requires (`converge`).  requests: of a plan.
 
@@ -176,6 +177,7 @@ def retrace(
         noise: estimate the noise; for a plane wave this takes a quarter more rays.
         quiet: largest noise of relative_rms as a fraction of it: for light other than a plane wave, the number of rays is increased
             until it is reached, by a factor of at most MOST_TIMES.
+        known: the image of a plane wave by bincount from an earlier call with the same arguments, which need not be traced again.
 
     Returns:
         the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by bincount,
@@ -194,7 +196,7 @@ def retrace(
         counted = found.exposure
         figures = _figures_of_halves(counted, target, found.halves) | {"error_estimate": found.error, "rays_traced": found.traced}
     elif even:
-        counted = trace("render", rays)
+        counted = known or trace("render", rays)
         figures = _figures_of_stratified(
             counted, target, tuple(trace(f"noise {k}", rays // PROBE) for k in (0, 1)) if noise else None
         )

@@ -76,6 +76,8 @@ def design(
     project, problem, first = prepared.project, prepared.problem, prepared.first
     if problem is None:
         return _again(project, device, say, began, movie, aim)
+    if first is not None:  # as a checkpoint keeps them
+        first = InitialHeights(*(None if z is None else rounded(z) for z in first))
     with project.hold:
         _compile(problem, say)
         state = Designer(problem).initial_state(*first or ())
@@ -265,8 +267,8 @@ def _run(
                     128 + asked[0],
                 )
             watch.keep_if_due(state)
-            watch.measure(state, always=True)
             state.heights = rounded(designer.within_limits(state))
+            watch.measure(state, always=True)
         with say.waiting("evaluation with independent rays", evaluation_seconds(designer, state)):
             evaluated = evaluate_and_write(project, designer, state, timed)
         field = designer.field(evaluated.state.stage)

@@ -96,8 +96,10 @@ class Watch:
         self.keep_if_due(now)
 
     def measure_if_due(self, now: State, begins: bool = False) -> None:
-        """Measure the error of the lens if this iteration is one of those planned, or the first of a stage."""
-        if begins or now.total in self.cost.due:
+        """Measure the error of the lens if this iteration is one of those planned, or the first of a stage; by rays the last once
+        the lens is as it is kept, whose image then serves the evaluation too."""
+        last = now.total == self.total and not self.designer.stages[now.stage].waves
+        if begins or (now.total in self.cost.due and not last):
             self.measure(now)
 
     def keep_if_due(self, now: State) -> None:
