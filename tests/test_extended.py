@@ -21,12 +21,12 @@ from caustic_cli.inverse import source_limits
 from caustic_cli.inverse.deconvolution import Blur, _cells, deconvolved, error_bound
 from caustic_cli.inverse.objective import Objective, SourceBlur
 from caustic_cli.inverse.schedule import LossImage, Stage
+from caustic_cli.inverse.source_image import source_images
 from caustic_cli.inverse.source_limits import etendue_limit, performance_limits, point_source, regular_rays, source_spread
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.coherent import modes, outermost_modes, vogel_disc
 from caustic_cli.optics.emission.regular import RegularGrid
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import Convolution, Spread
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System

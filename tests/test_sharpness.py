@@ -14,8 +14,8 @@ from caustic_cli.errors import InputError, at_least, at_most
 from caustic_cli.inverse import sharpness
 from caustic_cli.inverse.deconvolution import deconvolved
 from caustic_cli.inverse.sharpness import SHARP, STEPS, _blurred, advice, required_reduction, scaled_spread
+from caustic_cli.inverse.source_image import source_images
 from caustic_cli.inverse.source_limits import source_spread
-from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import Convolution, Spread
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen

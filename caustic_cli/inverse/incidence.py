@@ -159,21 +159,35 @@ class _WayToExit:
 
 def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
     """`incident` over the whole rectangle, traced through the lenses before the lens and in its medium."""
-    pupil, lens, way = scene.pupil, scene.lens, _WayToExit(scene)
-    shape, flat, grown = z.shape, z.ravel(), way.growth(float(z.mean()))
+    pupil, lens, shape = scene.pupil, scene.lens, z.shape
     goal = np.stack([c.ravel() for c in np.broadcast_arrays(x[:, None], y[None, :])])
-    found = [way.aimed(goal[:, k : k + CORNERS], flat[k : k + CORNERS], grown) for k in range(0, z.size, CORNERS)]
-    known, at, d, part = np.split(np.concatenate(found, axis=1).reshape(7, *shape), [1, 3, 6])
-    known, part = known[0] > 0.0, part[0]
+    known, at, d, part = (c.reshape(*c.shape[:-1], *shape) for c in _aimed(scene, goal, z.ravel()))
     ga, gb = (np.gradient(c, x, y) for c in at)
     power = part * np.abs(ga[0] * gb[1] - ga[1] * gb[0])
     inside = np.all([far / r <= 1 + ROUNDED for far, r in pupil.aperture.distances(*at)], axis=0)
     power = np.where(known & inside, power, 0.0)
     power = power * _pupil_irradiance(scene, *at)
-    goal = goal.reshape(2, *shape)
-    d = _extrapolated(d, known & (power > 0), goal / np.array(lens.half_size)[:, None, None])
-    n = medium_of(lens).relative_index((*(torch.from_numpy(c.ravel()) for c in goal), torch.from_numpy(flat - lens.z_in)))
-    return cell_means(power), tuple((n if isinstance(n, float) else n.numpy().reshape(shape)) * c for c in d)
+    points = np.concatenate([goal, z.reshape(1, -1)])
+    d = _extrapolated(d, known & (power > 0), goal.reshape(2, *shape) / np.array(lens.half_size)[:, None, None])
+    dx, dy, dz = _optical(scene, points, np.stack(d).reshape(3, -1)).reshape(3, *shape)
+    return cell_means(power), (dx, dy, dz)
+
+
+def _aimed(scene: Scene, goal: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of light that arrives at points (2, N) of heights z (N,): whether it was found (N,), where it crosses the pupil (2, N), its
+    unit directions in the glass (3, N), and its transmittance (N,), see `_WayToExit.aimed`."""
+    way = _WayToExit(scene)
+    grown = way.growth(float(z.mean()))
+    found = [way.aimed(goal[:, k : k + CORNERS], z[k : k + CORNERS], grown) for k in range(0, z.size, CORNERS)]
+    known, at, d, part = np.split(np.concatenate(found, axis=1), [1, 3, 6])
+    return known[0] > 0.0, at, d, part[0]
+
+
+def _optical(scene: Scene, at: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Unit directions (3, N) at points (3, N) of the exit, mm, of the length of the index there over that of the lens."""
+    x, y, z = (torch.from_numpy(np.ascontiguousarray(c)) for c in at)
+    n = medium_of(scene.lens).relative_index((x, y, z - scene.lens.z_in))
+    return (n if isinstance(n, float) else n.numpy()) * d
 
 
 def _extrapolated(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -300,13 +314,34 @@ def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
         profile = source.profile
         return (np.ones(shape) if profile is None else resampled(profile, shape)), None
     x0, y0, z0 = source.centre
-    h, t, n = lens.pupil.z - z0, z - lens.pupil.z, lens.inside
+    h, n = lens.pupil.z - z0, lens.inside
     if h <= 0:
         raise InputError(
             f"⟨source.file⟩: its rays meet at z = {z0:.4g} mm, not before the lens, as an initial surface by transport"
             " requires; ⟨start⟩ offset does not"
         )
-    dx, dy = x[:, None] - x0, y[None, :] - y0
+    q, (sx, sy) = _tangents(scene, x[:, None], y[None, :], z)
+    gx, gy = np.gradient(sx, x, y), np.gradient(sy, x, y)
+    cosine = 1.0 / np.sqrt(1.0 + q * q)
+    directions = _within(scene, q, (sx, sy))
+    power = np.abs(gx[0] * gy[1] - gx[1] * gy[0]) * cosine**3
+    if lens.fresnel != "none":
+        power *= 1.0 - reflectance("exact", cosine, directions[2], 1.0 / n)
+    power *= relative(source.intensity, q)
+    cone = min(source.cone_over(lens.pupil), 1.57079)
+    through = [np.abs(c0 + h * s) <= r * (1 + 1e-9) for c0, s, r in zip((x0, y0), (sx, sy), lens.half_size, strict=True)]
+    power = np.where((q <= math.tan(cone) * (1 + 1e-9)) & through[0] & through[1], power, 0.0)
+    light = irradiance(scene, x, y, float(z.mean()))
+    if light is None:
+        light = cell_means(power)
+    return light, directions
+
+
+def _tangents(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """q and s of the light of a near source's centre that reaches points of the exit, mm, arrays that can be broadcast."""
+    (x0, y0, z0), n = scene.source.centre, scene.lens.inside
+    h, t = scene.lens.pupil.z - z0, z - scene.lens.pupil.z
+    dx, dy = x - x0, y - y0
     rho = np.hypot(dx, dy)
     q = rho / (h + t / n)
     if n > 1.0:
@@ -319,18 +354,29 @@ def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
             break
     root = np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * q)
     ratio = 1.0 / (h + t / root)  # q / rho
-    sx, sy = dx * ratio, dy * ratio
-    gx, gy = np.gradient(sx, x, y), np.gradient(sy, x, y)
-    cosine = 1.0 / np.sqrt(1.0 + q * q)
-    inside = root * cosine / n
-    power = np.abs(gx[0] * gy[1] - gx[1] * gy[0]) * cosine**3
-    if lens.fresnel != "none":
-        power *= 1.0 - reflectance("exact", cosine, inside, 1.0 / n)
-    power *= relative(source.intensity, q)
-    cone = min(source.cone_over(lens.pupil), 1.57079)
-    through = [np.abs(c0 + h * s) <= r * (1 + 1e-9) for c0, s, r in zip((x0, y0), (sx, sy), lens.half_size, strict=True)]
-    power = np.where((q <= math.tan(cone) * (1 + 1e-9)) & through[0] & through[1], power, 0.0)
-    light = irradiance(scene, x, y, float(z.mean()))
-    if light is None:
-        light = cell_means(power)
-    return light, (sx * cosine / n, sy * cosine / n, inside)
+    return q, (dx * ratio, dy * ratio)
+
+
+def _within(scene: Scene, q: np.ndarray, s: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit directions behind the flat entrance of light of these tangents in front of it."""
+    n, cosine = scene.lens.inside, 1.0 / np.sqrt(1.0 + q * q)
+    root = np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * q)
+    return s[0] * cosine / n, s[1] * cosine / n, root * cosine / n
+
+
+def directions(scene: Scene, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (3, N) in front of the exit at points (3, N) of it, mm, of light of the source's centre, of the length of the
+    index there over that of the lens, and whether there is such light, (N,), arbitrary where there is none.
+
+    Raises:
+        InputError: as of `incident`.
+    """
+    x, y, z = at
+    if is_traced(scene):
+        known, _, d, part = _aimed(scene, at[:2], z)
+        return _optical(scene, at, d), known & (part > 0.0)
+    if scene.source.distant:
+        kx, ky = slopes_inside(scene.source.axis, scene.lens.inside)
+        d = np.array([kx, ky, 1.0]) / math.sqrt(1.0 + kx * kx + ky * ky)
+        return np.repeat(d[:, None], len(x), 1), np.ones(len(x), dtype=bool)
+    return np.stack(_within(scene, *_tangents(scene, x, y, z))), np.ones(len(x), dtype=bool)

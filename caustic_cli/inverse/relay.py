@@ -66,9 +66,20 @@ class RelayedScreen:
     @cached_property
     def system(self) -> System:
         """The elements behind the exit."""
-        whole = System.of(without_freeforms(self.scene))
-        after = [e.name for e in whole.elements].index(EXIT) + 1
-        return without_apertures(whole, after, len(whole.elements))
+        return without_apertures(self._whole, self._after, len(self._whole.elements))
+
+    @cached_property
+    def with_apertures(self) -> System:
+        """The same with their apertures."""
+        return replace(self.system, elements=self._whole.elements[self._after :])
+
+    @cached_property
+    def _whole(self) -> System:
+        return System.of(without_freeforms(self.scene))
+
+    @property
+    def _after(self) -> int:
+        return [e.name for e in self._whole.elements].index(EXIT) + 1
 
     @property
     def distance(self) -> float:
@@ -79,11 +90,12 @@ class RelayedScreen:
         """As of a `ScreenProjection`."""
         return (index - 1.0) * self.distance
 
-    def landing(self, origin: tuple, direction: tuple) -> tuple[np.ndarray, np.ndarray]:
-        """X of rays, NaN where they do not reach the screen."""
+    def landing(self, origin: tuple, direction: tuple, stopped: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """X of rays, NaN where they do not reach the screen; stopped: also of those that an aperture stops."""
         shape = np.broadcast_shapes(*map(np.shape, (*origin, *direction)))
-        state = trace_through(self.system, origin, direction)
-        tracer = Tracer(self.system, RayState(state.origin, state.direction, state.power))
+        system = self.with_apertures if stopped else self.system
+        state = trace_through(system, origin, direction)
+        tracer = Tracer(system, RayState(state.origin, state.direction, state.power))
         ray = tracer.onto(state, self.scene.screen)
         x, y = (torch.where(ray.power > 0, c, torch.nan).numpy().reshape(shape) for c in ray.origin[:2])
         return x, y

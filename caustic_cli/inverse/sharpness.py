@@ -24,8 +24,8 @@ import torch
 from caustic_cli.errors import alternatives
 from caustic_cli.inverse.deconvolution import deconvolved
 from caustic_cli.inverse.reachability import largest_magnification
+from caustic_cli.inverse.source_image import source_images
 from caustic_cli.inverse.source_limits import SHIFTS
-from caustic_cli.optics.source_image import source_images
 from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread
 from caustic_cli.scene import Disc, PlaneWave, Scene
 from caustic_cli.scene.sources.section import SUN
@@ -114,7 +114,10 @@ def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spr
     mag, ways = picture[0] * lens.array[0] / lens.size[0], []
 
     def reached(wanted: float, z: float, width: float = lens.size[0]) -> bool:
-        """Whether a magnification is accepted and can be reached by a lens of this width onto a screen at z."""
+        """Whether a magnification is accepted and can be reached by a lens of this width onto a screen at z; unknown among other
+        elements, through which the width of an image is not the throw times the angle of the source."""
+        if scene.unfolded.elements:
+            return False
         wider = width / lens.size[0]
         sized = replace(lens, size=(wider * lens.size[0], wider * lens.size[1]))
         other = replace(scene, source=PlaneWave(tilt=scene.source.tilt), lens=sized, screen=replace(scene.screen, z=z))

@@ -1,10 +1,11 @@
 """Fundamental limits set by an extended source: the least error behind its blur, and the most light that etendue allows.
 
-The image of any lens is a sum of images of the source by its points (`optics.source_image`), whose weights are not negative; the
+The image of any lens is a sum of images of the source by its points (`source_image`), whose weights are not negative; the
 error of every such sum is bounded from below (`deconvolution`).
 
 Etendue, the integral of cos cos / r^2 dA dA' over two areas, is conserved from the source to the screen: of light of etendue E_1
-through the lens at most the fraction E_2 / E_1 reaches a screen whose etendue with the lens is E_2.
+through the pupil at most the fraction E_2 / E_1 reaches a screen whose etendue with the exit of the lens is E_2.  Behind elements
+that is the integral over the rays from the exit to the first of them that reach the screen.
 """
 
 from __future__ import annotations
@@ -19,12 +20,14 @@ from caustic_cli.effort import STANDARD
 from caustic_cli.errors import at_most
 from caustic_cli.inverse.deconvolution import BOUND_STEPS, BOUND_WORK, FINEST, NO_ERROR, Blur, Deconvolved, deconvolved, error_bound
 from caustic_cli.inverse.projection import stretching_surface
+from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.schedule import Stage
+from caustic_cli.inverse.source_image import Sent, placed_images, source_images
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.emission.coherent import modes, spots
 from caustic_cli.optics.emission.regular import RegularGrid
+from caustic_cli.optics.frames import to_global
 from caustic_cli.optics.screen_shape import normals, points_in_space
-from caustic_cli.optics.source_image import Sent, placed_images, source_images
 from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Aperture, CircularAperture, Scene, Source
@@ -34,7 +37,7 @@ from caustic_cli.scene.traits import Capability
 
 LIMITS = Capability(
     "limits by the source",
-    {"other elements": "what stands before the screen decides which etendue it accepts"},
+    {"unknown elements": "what is designed between lens and screen decides which etendue that accepts"},
 )
 CONVOLUTION = Capability(
     "design by convolution with the source",
@@ -49,6 +52,9 @@ SHIFTS = 0.35
 EXACT, MOST_MODES = 0.2, 24
 #: Points along each axis of an area.
 POINTS = 12
+#: Sets of rays from the exit to the element behind it, and rays of each; the rectangle about that element through which those that
+#: it takes pass its vertex plane, in its half widths; standard errors of the sets' mean that this is taken larger by.
+SETS, BEHIND, AROUND, ABOVE = 8, 1 << 15, 1.5, 3.0
 #: Least half width of the blur, pixels, for which the least error is computed.
 LEAST_REACH = 0.5
 #: Least half width of the blur, binned pixels, for the least error.
@@ -176,26 +182,56 @@ def regular_rays(
 
 def etendue_limit(scene: Scene) -> float | None:
     """E_2 / E_1, at most 1; None for a source without area or of uneven radiance, and for several."""
-    lens, screen, source = scene.lens, scene.screen, scene.source
+    source, pupil = scene.source, scene.pupil
     if not source.even or len(source.members) > 1:
         return None
-    x, y, cell = _area(lens.half_size, lens.clear)
+    x, y, cell = _area(pupil.half_size, pupil.aperture if scene.in_front else scene.lens.clear)
     area = cell * len(x)
     if source.distant:
         given = area * math.pi * math.sin(source.half_angle) ** 2 * source.axis[2]
     elif min(source.extent) > 0 and len(source.points()[0]) == 1:
         a, b, part = _area(source.extent, CircularAperture())
         x0, y0, z0 = source.points()[0][0]
-        seen = _geometric_factor(x, y, (a + x0, b + y0, z0 - lens.pupil.z))
-        slope = np.hypot(a + x0 - x[:, None], b + y0 - y[:, None]) / (lens.pupil.z - z0)
-        cone = source.cone_over(lens.pupil)
+        seen = _geometric_factor(x, y, (a + x0, b + y0, z0 - pupil.z))
+        slope = np.hypot(a + x0 - x[:, None], b + y0 - y[:, None]) / (pupil.z - z0)
+        cone = source.cone_over(pupil)
         given = cell * part * seen[(np.arctan(slope) <= cone) & (relative(source.intensity, slope) > 0)].sum()
     else:
         return None
+    return min(1.0, _accepted(scene) / float(given)) if given > 0 else None
+
+
+def _accepted(scene: Scene) -> float:
+    """E_2, mm^2 sr."""
+    lens, screen = scene.lens, scene.screen
+    if scene.behind:
+        return _relayed(scene)
+    x, y, cell = _area(lens.half_size, lens.clear)
     a, b, part = _area(screen.half_size, UNBOUNDED)
     px, py, pz = points_in_space(screen, a, b)
-    taken = cell * part * _geometric_factor(x, y, (px, py, pz - lens.offset.thickness), normals(screen, a, b)).sum()
-    return min(1.0, float(taken / given)) if given > 0 else None
+    return float(cell * part * _geometric_factor(x, y, (px, py, pz - lens.offset.thickness), normals(screen, a, b)).sum())
+
+
+def _relayed(scene: Scene) -> float:
+    """E_2, mm^2 sr, behind other elements, from rays between points of the exit and of the first of them: an upper bound by ABOVE
+    standard errors of randomised sets of low discrepancy."""
+    lens, screen, relay = scene.lens, scene.screen, RelayedScreen(scene, scene.lens.offset.thickness)
+    first = relay.with_apertures.elements[0]
+    wide = [AROUND * h for h in first.aperture.half_size]
+    points = [torch.quasirandom.SobolEngine(4, scramble=True, seed=k).draw(BEHIND, dtype=torch.float64) for k in range(SETS)]
+    x, y, a, b = ((2.0 * torch.cat(points) - 1.0) * torch.tensor([*lens.half_size, *wide], dtype=torch.float64)).T
+    exit = (x, y, torch.full_like(x, lens.offset.thickness))
+    to = to_global(first.pose, (a, b, torch.zeros_like(a)), 0.0)
+    d = [(q - p).numpy() for p, q in zip(exit, to, strict=True)]
+    r = np.sqrt(sum(c * c for c in d))
+    facing = np.abs(d[2]) * np.abs(sum(c * axis for c, axis in zip(d, first.pose.axes[2], strict=True))) / r**4
+    landed = relay.landing(tuple(c.numpy() for c in exit), tuple(c / r for c in d), stopped=True)
+    with np.errstate(invalid="ignore"):
+        on = [np.abs(c - s) <= h for c, s, h in zip(landed, screen.shift, screen.half_size, strict=True)]
+    lit = lens.clear.contains(x, y).numpy() & on[0] & on[1]
+    means = np.where(lit, facing, 0.0).reshape(SETS, -1).mean(1)
+    most = means.mean() + ABOVE * means.std(ddof=1) / math.sqrt(SETS)
+    return float(16.0 * math.prod(lens.half_size) * math.prod(wide) * most)
 
 
 def _area(half: tuple[float, float], shape: Aperture) -> tuple[np.ndarray, np.ndarray, float]:

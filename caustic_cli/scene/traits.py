@@ -47,7 +47,15 @@ TRAITS: Mapping[str, Trait] = {
     "gradient index": Trait("an index that varies", lambda s: s.lens.gradient is not None, ("lens.gradient",)),
     "two sides": Trait("a curved entrance", lambda s: s.two_sided, ("second.file", "second.collimate", "second.focus")),
     "designed entrance": Trait("a given curved entrance", lambda s: s.lens.entrance is not None),
+    "unknown entrance": Trait(
+        "an entrance that is designed with it",
+        lambda s: s.second_target is not None,
+        ("second.file", "second.collimate", "second.focus"),
+    ),
     "other elements": Trait("other elements beside it", lambda s: bool(s.unfolded.elements), ("element.reshapes",)),
+    "unknown elements": Trait(
+        "other elements that are designed with it", lambda s: any(e.free_sides for e in s.elements), ("element.free",)
+    ),
     "folded axis": Trait("an axis folded by flat mirrors", lambda s: s.unfolded is not s),
     "lenslet array": Trait("lenslets", lambda s: s.lens.arrayed, ("lens.array",)),
     "round lenslets": Trait("an opaque mask between round lenslets", lambda s: s.lens.round_lenslets, ("lens.lenslets round",)),

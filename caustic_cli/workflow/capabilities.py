@@ -17,7 +17,7 @@ PLACES = (
     "inverse.reachability:REACHABILITY",
     "inverse.source_limits:LIMITS",
     "inverse.source_limits:CONVOLUTION",
-    "optics.source_image:SOURCE_IMAGES",
+    "inverse.source_image:SOURCE_IMAGES",
     "optics.resolution:PARAXIAL",
     "studies.manufacture:WALL",
     "studies.manufacture:THROW",
