@@ -230,11 +230,19 @@ def test_a_wave_image_names_the_wavelengths_of_all_sources():
 
 def test_a_picture_out_of_the_reach_of_one_source_may_be_within_that_of_another():
     """Glass of index 1.5 deflects by less than arccos(1 / 1.5) = 48.2 degrees: light along the axis does not reach a picture 60
-    degrees from it, light that arrives at 45 degrees, 28 in the glass, does."""
+    degrees from it, light that arrives at 45 degrees, 28 in the glass, does, of points as of the rays of a file."""
     lens = Lens((10.0, 10.0), control=(8, 8), index=1.5, offset=Offset(5.0))
     screen = Screen((10.0, 10.0), 105.0, (8, 8), shift=(100.0 * math.tan(math.radians(60.0)), 0.0))
     axial, aslant = PlaneWave(), Points(((-100.0, 0.0, -100.0),))
-    reaches = {False: [axial, Several((axial, axial), (NONE, NONE))], True: [aslant, Several((axial, aslant), (NONE, NONE))]}
+    start = np.array([[0.1 * k, 0.0, -100.0] for k in range(20)])
+    below, beside = (
+        Measured(RaySet(start + np.array([x, 0.0, 0.0]), np.array([[slope, 0.0, 1.0]] * 20), np.ones(20)), (0.0, 0.0, 0.0))
+        for x, slope in ((0.0, 0.0), (-100.0, 1.0))
+    )
+    reaches = {
+        False: [axial, below, Several((axial, axial), (NONE, NONE)), Several((axial, below), (NONE, NONE))],
+        True: [aslant, beside, Several((axial, aslant), (NONE, NONE)), Several((below, beside), (NONE, NONE))],
+    }
     for reached, sources in reaches.items():
         for source in sources:
             with nullcontext() if reached else pytest.raises(InputError, match="deflects it by less than 48"):

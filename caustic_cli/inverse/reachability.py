@@ -12,8 +12,10 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 
 import numpy as np
+import torch
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.scene import Scene
@@ -22,14 +24,13 @@ from caustic_cli.scene.traits import Capability
 
 REACHABILITY = Capability(
     "check of what refraction can reach",
-    {
-        "mirror": "reflection deflects by any angle",
-        "ray file": "its rays are followed by the design itself",
-    },
+    {"mirror": "reflection deflects by any angle"},
 )
 
 #: Points along each axis of the entrance, and of the picture at most.
 ENTRANCE, PICTURE = 17, 15
+#: Most rays of a file.
+FILED = 1 << 14
 #: Pairs of a ray in the glass and a point of the picture treated at a time, 50 bytes each.
 PAIRS = 1 << 20
 #: Points of an extended source, in parts of its half widths along x and y: its centre, and its outermost along each axis.
@@ -97,8 +98,16 @@ def _in_glass(scene: Scene, rays: int) -> Iterator[tuple[np.ndarray, np.ndarray,
     """Points x, y (k,) of the entrance where light of the source falls, mm, and its unit directions in the glass there (3, k).
 
     The points of a source in turn, about `rays` rays at a time, so that the memory does not depend on their number.
+
+    Raises:
+        InputError: none of the rays of a file meets the lens.
     """
     source, lens = scene.source, scene.lens
+    if source.rays is not None:
+        for state in rays_of(scene, "sobol", FILED).chunks(rays):
+            x, y, dx, dy, dz = (torch.as_tensor(c).numpy() for c in (*state.origin[:2], *state.direction))
+            yield _refracted(scene, x, y, dx / dz, dy / dz)
+        return
     x, y = (c.ravel() for c in np.meshgrid(*(np.linspace(-h, h, ENTRANCE) for h in lens.half_size), indexing="ij"))
     inside = np.all([far <= r * (1.0 + 1e-9) for far, r in lens.opening.distances(x, y)], axis=0)
     x, y = x[inside], y[inside]

@@ -24,13 +24,15 @@ from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.source_image import Sent, placed_images, source_images
 from caustic_cli.optics.emission import Rays, rays_of
-from caustic_cli.optics.emission.coherent import modes, spots
+from caustic_cli.optics.emission.coherent import Mode, modes, spots
 from caustic_cli.optics.emission.regular import RegularGrid
+from caustic_cli.optics.emission.several import of_one
 from caustic_cli.optics.frames import to_global
 from caustic_cli.optics.screen_shape import normals, points_in_space
-from caustic_cli.optics.spread import Convolution, Spread, spread_at
+from caustic_cli.optics.spread import POINT, Convolution, Spread
+from caustic_cli.optics.spreads import Spreads, spreads_at
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.scene import Aperture, CircularAperture, Scene, Source
+from caustic_cli.scene import Aperture, CircularAperture, PlaneWave, Points, Scene, Source
 from caustic_cli.scene.aperture import UNBOUNDED
 from caustic_cli.scene.sources.distribution import relative
 from caustic_cli.scene.traits import Capability
@@ -38,10 +40,6 @@ from caustic_cli.scene.traits import Capability
 LIMITS = Capability(
     "limits by the source",
     {"unknown elements": "what is designed between lens and screen decides which etendue that accepts"},
-)
-CONVOLUTION = Capability(
-    "design by convolution with the source",
-    dict.fromkeys(("separate places", "several sources"), "its places have images of their own"),
 )
 
 #: The blur is taken as a convolution where the deviation from it is at most this fraction of its half width.
@@ -125,17 +123,18 @@ def _least_error(target: np.ndarray, scene: Scene, images: list[Spread], sent: S
     return error_bound(binned, blurs, most_steps)
 
 
-def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int) -> Deconvolved:
+def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread | Spreads, steps: int) -> Deconvolved:
     """The deconvolution of a target by the source's blur on the screen of a scene, see `deconvolved`, to light that is even over
     each pixel, as a transport map makes it."""
     return deconvolved(target, spread.on(scene.screen.pixel).of_even_pixels, steps)
 
 
-def source_spread(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
-    """The point-spread function of an extended source; None for a point source, where the blur is not well approximated by a
-    convolution, where it is wider than the screen, or before several surfaces are designed."""
+def source_spread(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | Spreads | None:
+    """The point-spread function of an extended source or of several; None for a point source, where the blur is not well
+    approximated by a convolution, where it is wider than the screen, before several surfaces are designed, or where each of several
+    sources has a lenslet of its own."""
     scene = scene.unfolded
-    if not (scene.source.extended and CONVOLUTION.supports(scene)):
+    if not scene.source.extended or scene.source.by_lenslet:
         return None
     if heights is None and scene.joint:  # the offset of one surface does not represent a lens with several
         return None
@@ -144,39 +143,50 @@ def source_spread(scene: Scene, field: HeightField | None = None, heights: torch
         field = HeightField.of(scene.lens)
         x, y = (c.numpy() for c in field.control_xy())
         heights = torch.from_numpy(stretching_surface(scene, x, y) if scene.source.oblique else scene.lens.offset.heights(x, y))
-    found = spread_at(scene, field, heights)
+    found = spreads_at(scene, field, heights)
     if found is None or found.usual > SHIFTS * max(found.reach()) or max(found.reach()) > max(scene.screen.size):
         return None
     return found
 
 
 def point_source(scene: Scene) -> Source:
-    """A point source at the centre of the extended one, with the same cone."""
-    source = scene.source.pointlike()
-    if not source.distant and source.cone is None:
-        cone = scene.source.cone_over(scene.lens.pupil)
-        return replace(source, cone=math.degrees(cone))
-    return source
+    """A point source at the centre of the extended one, or of several, with the same cone."""
+    source, cone = scene.source, None if scene.source.distant else math.degrees(scene.source.cone_over(scene.lens.pupil))
+    if len(source.members) > 1:
+        return PlaneWave(source.power, tilt=source.tilt) if source.distant else Points((source.centre,), (source.power,), cone=cone)
+    point = source.pointlike()
+    return point if source.distant or point.cone is not None else replace(point, cone=cone)
 
 
-def points_of(spread: Spread) -> int:
-    """Number of points of a source whose blurs represent it: one if the blur varies little over it, or has no parts."""
-    if spread.exchanged:
+def points_of(spread: Spread | Spreads) -> int:
+    """Number of points of a source, or of each of several, whose blurs represent it: one if the blur varies little over it, or has
+    no parts."""
+    if isinstance(spread, Spreads) or spread.exchanged:
         return 1
     each = math.ceil((spread.usual / (EXACT * max(spread.reach()))) ** 2)
     return 1 if each <= 1 or not min(spread.half) > 0 else min(each, MOST_MODES)
 
 
 def regular_rays(
-    scene: Scene, spread: Spread, stage: Stage, seed: int, device: str | torch.device
+    scene: Scene, spread: Spread | Spreads, stage: Stage, seed: int, device: str | torch.device
 ) -> tuple[Scene, Rays | list[Rays], list[Convolution]]:
-    """Rays of a stage whose images are convolved with the blur: from the centre of the source, or from several of its points where
-    the blur varies over it; with the scene to trace them in and the convolution for the image of each point."""
-    pixel, each = scene.screen.pixel, points_of(spread)
+    """Rays of a stage whose images are convolved with the blur: from the centre of the source or of each of several, from each of
+    separate points, or from several points of a source over which the blur varies; with the scene to trace them in and the
+    convolution for the image of each point."""
+    pixel, each, cut = scene.screen.pixel, points_of(spread), stage.rendering.oversample
+    if isinstance(spread, Spreads):
+        centres = [replace(one, source=point_source(one)) for one in scene.by_source]
+        points = replace(scene.source, members=tuple(one.source for one in centres))
+        count = max(1, stage.rays // len(centres))
+        rays = [of_one(rays_of(c, stage.sampler, count, seed + k, device), k, points) for k, c in enumerate(centres)]
+        return replace(scene, source=points), rays, spread.about_each(pixel, cut)
+    if scene.source.apart:
+        places = [Mode(scene, tuple(at), float(part)) for at, part in zip(*scene.source.points(), strict=True)]
+        return scene, RegularGrid.of_modes(places, stage.rays, device), [POINT.on(pixel, cut)] * len(places)
     if each == 1:
         scene = replace(scene, source=point_source(scene))
-        return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, stage.rendering.oversample)]
-    parts = spread.parts_on(pixel, spots(scene.source, each), stage.rendering.oversample)
+        return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, cut)]
+    parts = spread.parts_on(pixel, spots(scene.source, each), cut)
     return scene, RegularGrid.of_modes(modes(scene, each), stage.rays, device), parts
 
 

@@ -8,7 +8,7 @@ maximum over the light, `usual` a quantile of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -118,10 +118,8 @@ class Spread:
         cut = _cut(min(h for h in self.half if h > 0) / math.sqrt(len(places)), pixel, most)
         places = [tuple(p) for p in np.array(places) @ np.array(self.turn).T]
         cell = (pixel[0] / cut, pixel[1] / cut)
-        kernels = [self.kernel(cell, (places, k)) for k in range(len(places))]
-        a, b = (max(kernel.shape[axis] for kernel in kernels) for axis in (0, 1))  # all are odd
-        alike = [np.pad(k, [((n - m) // 2,) * 2 for n, m in zip((a, b), k.shape, strict=True)]) for k in kernels]
-        return [Convolution(torch.from_numpy(kernel), cut) for kernel in alike]
+        kernels = alike([self.kernel(cell, (places, k)) for k in range(len(places))])
+        return [Convolution(torch.from_numpy(kernel), cut) for kernel in kernels]
 
     def _sheared(self, x: np.ndarray, y: np.ndarray, cell: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
         """Points (x, y), mm, with the skew, in cells."""
@@ -162,6 +160,12 @@ class Spread:
                 weight = power[:, None] * light * np.abs(1 - p - (at_x - i)) * np.abs(1 - q - (at_y - j))
                 found += np.bincount(((i + p) * (2 * b + 2) + j + q).ravel(), weight.ravel(), len(found))
         return found.reshape(2 * a + 2, 2 * b + 2)[:-1, :-1]
+
+
+def alike(kernels: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Kernels with an odd number of cells along each axis, padded to a common shape."""
+    a, b = (max(kernel.shape[axis] for kernel in kernels) for axis in (0, 1))
+    return [np.pad(k, [((n - m) // 2,) * 2 for n, m in zip((a, b), k.shape, strict=True)]) for k in kernels]
 
 
 #: That of a point source.
@@ -248,6 +252,11 @@ class Convolution:
 
 def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | None:
     """Point-spread function of a scene's source on its screen, for a lens with heights (n, m) mm; None if there is none."""
+    return spread_of(System.of(scene, field), landing_of(scene, field, heights), heights.device)
+
+
+def landing_of(scene: Scene, field: HeightField, heights: Tensor) -> Landing:
+    """Where the light of a scene's source lands behind a lens with heights (n, m) mm."""
     system, parameters = System.of(scene, field), {EXIT: heights.detach().double()}
 
     def landing(mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -255,19 +264,26 @@ def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | Non
         state, left = tracer.land(parameters, scene.screen)[0].expanded(), tracer.ends(parameters)[0].state.expanded()
         return *state.full(state.origin)[:2], state.power, *left.full(left.origin)[:2]
 
-    return spread_of(system, landing, heights.device)
+    return landing
 
 
-@torch.no_grad()
 def spread_of(lit: Illuminated, landing: Landing, device: str | torch.device = "cpu") -> Spread | None:
     """Point-spread function of an extended source; None for other sources, for positions at several depths, or if light misses.
 
     Raises:
         as `landing`.
     """
-    source, outer, centre = lit.source, outermost_modes(lit), central_mode(lit)
-    if source.rays is not None or len(source.members) > 1:
+    if lit.source.rays is not None or len(lit.source.members) > 1:
         return None
+    found = displacements(lit, landing, device)
+    return None if found is None else Spread.of(lit.source, *found)
+
+
+@torch.no_grad()
+def displacements(lit: Illuminated, landing: Landing, device: str | torch.device = "cpu") -> tuple[np.ndarray, float, float] | None:
+    """Displacement of landing points by that of the source's point, (2, 2), mm per mm or direction sine, and the largest deviation
+    from it, mm, with its quantile MOST; as of `spread_of`."""
+    source, outer, centre = lit.source, outermost_modes(lit), central_mode(lit)
     if not outer or (not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0):
         return None
     line = torch.linspace(0.0, 1.0, POINTS, dtype=torch.float64, device=device)
@@ -285,12 +301,8 @@ def spread_of(lit: Illuminated, landing: Landing, device: str | torch.device = "
         if not bool(lit_too.any()):
             return None
         moved.append([(to_x - x)[lit_too], (to_y - y)[lit_too]])
-    # Shift per displacement of the source point, from the outermost points along each axis, and the deviation from linearity.
-    by = np.zeros((2, 2))
+    # Shift per displacement of the source point, by least squares over the outermost points, and the deviation from linearity.
     at = [offset(source, mode.position) for mode in outer]
-    for k in (0, 1):
-        (up, down), (high, low) = at[2 * k : 2 * k + 2], moved[2 * k : 2 * k + 2]
-        apart = up[k] - down[k]
-        by[:, k] = [float(high[i].mean() - low[i].mean()) / apart if apart else 0.0 for i in (0, 1)]
+    by = np.linalg.lstsq(np.array(at), np.array([[float(c.mean()) for c in m] for m in moved]), rcond=None)[0].T
     off = torch.cat([torch.hypot(*(m[i] - by[i] @ p for i in (0, 1))) for p, m in zip(at, moved, strict=True)])
-    return Spread.of(source, by, float(off.max()), float(torch.quantile(off, MOST)))
+    return by, float(off.max()), float(torch.quantile(off, MOST))

@@ -16,7 +16,6 @@ PLACES = (
     "inverse.gradient_index:INDEX_DESIGN",
     "inverse.reachability:REACHABILITY",
     "inverse.source_limits:LIMITS",
-    "inverse.source_limits:CONVOLUTION",
     "inverse.source_image:SOURCE_IMAGES",
     "optics.resolution:PARAXIAL",
     "studies.manufacture:WALL",

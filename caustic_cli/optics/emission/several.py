@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -34,6 +35,22 @@ class SeveralRays:
                     yield replace(rays, flux=fraction * rays.flux)
                 else:
                     yield replace(rays, power=fraction * rays.power, lost={k: fraction * v for k, v in rays.lost.items()})
+
+
+class _NoRays:
+    """No rays at all."""
+
+    count = 0
+
+    def chunks(self, size: int = 1 << 20) -> Iterator[Sample | RayState]:
+        """As of an `Emission`."""
+        return iter(())
+
+
+def of_one(rays: Any, number: int, source: Source) -> SeveralRays:
+    """Rays of one of several sources, by its index, and none of the others."""
+    members = tuple(rays if k == number else _NoRays() for k in range(len(source.members)))
+    return SeveralRays(members, source.fractions, rays.device)
 
 
 @dataclass(frozen=True)
