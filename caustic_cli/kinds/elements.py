@@ -44,7 +44,8 @@ class AmongElements(OneSurface):
             super().refuse_unreachable()
 
     def resolution_notes(self, seen: Resolution) -> Iterator[str]:
-        if self._folded:
+        """But for an extended source behind elements in front of the lens, which change how wide it looks from there."""
+        if not (self.scene.in_front and self.scene.source.extended):
             yield from super().resolution_notes(seen)
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError, at_most
 from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.media import medium_of
-from caustic_cli.optics.resolution import Resolution, paraxial
+from caustic_cli.optics.resolution import Resolution, follows_from_exit, paraxial, traced
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System, entrance_of
@@ -185,16 +185,18 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
 
 def ghost_error(scene: Scene, field: HeightField, heights: Tensor, part: float, n: float) -> float:
     """Estimate of the relative RMS that the first ghost adds to the image if it carries the fraction `part` of the power; n: index;
-    0 for a scene without `paraxial` data.
+    by traced ghosts where light does not follow from the exit, and 0 before all surfaces have heights.
 
     To first order a slope g deflects light by (n - 1) g and its first ghost by (3 n - 1) g.  A ghost whose map x -> X has the
     Jacobian J gives the irradiance part / (A |det J|) at X, A the aperture's area, so that over a screen of area S its mean square
     is part^2 S / A times the mean over the lens of 1 / |det J|.  The eigenvalues of J are reduced by the error of the first-order
     approximation, and bounded below by a pixel over the lens' width.
     """
-    light = paraxial(scene, field, heights) if part > 0.0 else None
-    if light is None:
+    if not part > 0.0:
         return 0.0
+    if not follows_from_exit(scene):
+        return traced.ghost_error(scene, field, heights) if traced.is_known(scene, field) else 0.0
+    light = paraxial(scene, field, heights)
     lens, screen = scene.lens, scene.screen
     gain = light.throw * (3.0 * n - 1.0)
     x, y = light.x * light.straight + gain * light.gx, light.y * light.straight + gain * light.gy

@@ -1,7 +1,8 @@
 """Resolution limit of a lens: the blur by diffraction and source extent, and the number of resolvable details.
 
 At local magnification M and distance L, diffraction blurs a point to a width of about sqrt(lambda L M), the geometric mean of the
-Fresnel scale sqrt(lambda L) and M times that scale.
+Fresnel scale sqrt(lambda L) and M times that scale.  Through elements behind the lens the displacement on the screen by the tangent
+of a ray takes the place of L (B of their ABCD matrix, as in the diffraction integral of Collins, J. Opt. Soc. Am. 60, 1970).
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.scene import Lens, Scene
-from caustic_cli.scene.traits import Capability
+
+traced = OnDemand("caustic_cli.optics.traced_map")
 
 #: Wavelength, nm, that represents light of unspecified wavelength.
 GREEN = 550.0
@@ -50,7 +53,7 @@ class Resolution:
         """Of a scene with a picture of this width, mm, and a lens of this (local) magnification."""
         lens, screen = scene.lens, scene.screen
         wavelength = scene.light.mean
-        distance = abs(screen.z - lens.offset.thickness)
+        distance = (traced.distance(scene) if scene.unfolded.behind else None) or abs(screen.z - lens.offset.thickness)
         return cls(
             diffraction_blur(wavelength, distance, magnification),
             scene.source.blur(_seen_from(lens), distance),
@@ -71,8 +74,8 @@ class Resolution:
 
     @classmethod
     def at(cls, scene: Scene, field: HeightField, heights: Tensor) -> Resolution:
-        """Of a lens with heights (n, m) mm, from its local magnification, with the screen for the picture; with two free-form sides
-        or other elements from the nominal magnification."""
+        """Of a lens with heights (n, m) mm, from its local magnification, with the screen for the picture; from the nominal
+        magnification where other surfaces have no heights yet."""
         magnification = local_magnification(scene, field, heights)
         if magnification is None:
             return cls.before(scene, scene.screen.size)
@@ -140,26 +143,21 @@ class Paraxial:
     straight: float
 
 
-PARAXIAL = Capability(
-    "paraxial estimates by the exit",
-    {
-        **dict.fromkeys(("two sides", "other elements"), "the exit alone does not determine where light lands"),
-        "tilted light": "they are those of light near the axis",
-    },
-)
-
-
 def _seen_from(lens: Lens) -> float:
     """z, mm, from which the apparent distance of a source at the exit is measured: glass appears thinner by the factor n."""
     return lens.z_in + (lens.offset.thickness - lens.z_in) / lens.inside
 
 
-def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial | None:
-    """Paraxial data of a scene's lens with heights (n, m) mm at POINTS^2 points, for light from the source's centre; None if its
-    exit alone does not determine where light lands."""
+def follows_from_exit(scene: Scene) -> bool:
+    """Whether the slopes of the exit alone determine to first order where light lands: near the axis, behind a flat entrance, in
+    glass of one index, without other elements."""
+    return not (scene.two_sided or scene.unfolded.elements or scene.source.oblique or scene.lens.gradient is not None)
+
+
+def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial:
+    """Paraxial data of a scene's lens with heights (n, m) mm at POINTS^2 points, for light from the source's centre, where it
+    `follows_from_exit`."""
     lens = scene.lens
-    if not PARAXIAL.supports(scene):
-        return None
     distance = abs(scene.screen.z - lens.offset.thickness)
     vergence = 0.0 if scene.source.distant else 1.0 / (_seen_from(lens) - scene.source.centre[2])
     line = (torch.arange(POINTS, dtype=torch.float64, device=heights.device) + 0.5) * (2.0 / POINTS) - 1.0
@@ -169,14 +167,14 @@ def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial | No
 
 
 def local_magnification(scene: Scene, field: HeightField, heights: Tensor) -> float | None:
-    """Square root of the mean areal magnification |det dX/ds|: paraxial, from the surface's second derivatives; None where there
-    is no such data.
+    """Square root of the mean areal magnification |det dX/ds|: paraxial, from the surface's second derivatives, or by neighbouring
+    rays where it does not follow from these; None where other surfaces have no heights yet.
 
     Light from s lands at X = s (1 + L / a) + L g grad h, a the distance of the source and g = n - 1, or 2 for a mirror.
     """
+    if not follows_from_exit(scene):
+        return traced.local_magnification(scene, field, heights) if traced.is_known(scene, field) else None
     light = paraxial(scene, field, heights)
-    if light is None:
-        return None
     gain = light.throw * abs(scene.lens.effective_index - 1.0)
     xx, xy, yy = gain * light.xx, gain * light.xy, gain * light.yy
     return float(((light.straight + xx) * (light.straight + yy) - xy * xy).abs().mean().sqrt())

@@ -17,7 +17,6 @@ PLACES = (
     "inverse.reachability:REACHABILITY",
     "inverse.source_limits:LIMITS",
     "inverse.source_image:SOURCE_IMAGES",
-    "optics.resolution:PARAXIAL",
     "studies.manufacture:WALL",
     "studies.manufacture:THROW",
     "workflow.outputs:OUTPUTS",
