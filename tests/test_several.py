@@ -31,7 +31,7 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import lines_of, wave_image
 from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
-from caustic_cli.scene import Aperture, Disc, Lens, Light, Offset, PlaneWave, Points, Pupil, Scene, Screen
+from caustic_cli.scene import Aperture, Disc, FreeForm, Lens, Light, Offset, PlaneWave, Points, Pupil, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
@@ -226,6 +226,17 @@ def test_a_wave_image_names_the_wavelengths_of_all_sources():
     field = HeightField.of(scene.lens)
     z = torch.full(field.shape, 5.0, dtype=torch.float64)
     assert wave_image(scene, field, z).wavelengths == (620.0, 450.0, 500.0)
+
+
+@pytest.mark.parametrize(("slope", "reach"), [(0.0, 48.19), (-0.4, 48.19 + 7.46), (0.4, 48.19 - 7.46)])
+def test_an_inclined_entrance_moves_what_refraction_reaches(slope, reach):
+    """By the angle of the light behind it: psi - asin(sin psi / n), psi = atan 0.4 = 21.80 degrees."""
+    front = FreeForm(np.repeat(5.0 * slope * np.linspace(-1.0, 1.0, 4)[:, None], 4, 1), (3, 3)) if slope else None
+    lens = Lens((10.0, 10.0), control=(8, 8), index=1.5, offset=Offset(8.0), z_in=0.0, entrance=front)
+    for angle, reached in ((reach - 0.3, True), (reach + 0.3, False)):
+        screen = Screen((1.0, 1.0), 20_000.0, (8, 8), shift=(20_000.0 * math.tan(math.radians(angle)), 0.0))
+        with nullcontext() if reached else pytest.raises(InputError, match="deflects it by less than 48"):
+            refuse_unreachable(Scene(PlaneWave(), lens, screen), np.ones((8, 8)))
 
 
 def test_a_picture_out_of_the_reach_of_one_source_may_be_within_that_of_another():

@@ -29,13 +29,14 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.relay import trace_through, without_apertures, without_freeforms
 from caustic_cli.inverse.transport import cell_means
 from caustic_cli.optics.emission.measured import irradiance
+from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.interface import reflectance, slopes_inside
 from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.parallel import beyond_aperture
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
-from caustic_cli.scene import Aperture, Scene
+from caustic_cli.scene import Aperture, PlaneWave, Points, Scene, Source
 from caustic_cli.scene.sources.distribution import relative
 
 #: Newton iterations for q; the function is concave, so that they increase monotonically from the greater of two lower bounds.
@@ -380,3 +381,26 @@ def directions(scene: Scene, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         d = np.array([kx, ky, 1.0]) / math.sqrt(1.0 + kx * kx + ky * ky)
         return np.repeat(d[:, None], len(x), 1), np.ones(len(x), dtype=bool)
     return np.stack(_within(scene, *_tangents(scene, x, y, z))), np.ones(len(x), dtype=bool)
+
+
+def is_aimed(scene: Scene) -> bool:
+    """Whether rays can be aimed at points of the exit: not where the light is focused within the lens."""
+    try:
+        return not is_traced(scene) or bool(_WayToExit(scene).growth(scene.lens.offset.thickness).all())
+    except InputError:
+        return False
+
+
+def from_point(scene: Scene, moved: tuple[float, float]) -> Scene:
+    """The scene with a point source or plane wave in place of its source: of a point of that which is displaced by `moved` from its
+    centre, mm, or direction sines across the axis of a distant one."""
+    source = scene.source
+    point: Source
+    if source.distant:
+        length = math.sqrt(1.0 - moved[0] ** 2 - moved[1] ** 2)
+        x, y, z = (length * c for c in turned_about(source.axis, *(m / length for m in moved)))
+        point = PlaneWave(tilt=(math.degrees(-math.asin(y)), math.degrees(math.atan2(x, z))))
+    else:
+        x, y, z = source.centre
+        point = Points(((x + moved[0], y + moved[1], z),))
+    return replace(scene, source=point)

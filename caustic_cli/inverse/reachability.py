@@ -2,20 +2,23 @@
 
 Refraction out of glass of index n deflects a ray by less than arccos(1 / n): between the direction d in the glass and t behind the
 surface, n (d . t) > 1.  Entrance and picture are sampled; the exit is taken at the height of its offset and, for light that would
-leave a thick lens through its sides, at the least height.
+leave a thick lens through its sides, at the least height.  Behind a curved entrance, or in a medium whose index varies, the rays
+to points of the exit at these heights are traced, and n is the index there.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from itertools import chain
+from itertools import chain, product
 
 import numpy as np
 import torch
 
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.incidence import directions, from_point, is_aimed, is_traced
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.emission.coherent import central_mode, offset, outermost_modes
 from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.scene import Scene
@@ -44,12 +47,15 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
         InputError: no light falls on the lens, or none of it can be deflected far enough.
     """
     lens, limit = scene.lens, scene.lens.interaction.largest_deflection(scene.lens.index)
-    if not all(map(REACHABILITY.supports, scene.by_source)):
+    each = scene.by_source
+    if not REACHABILITY.supports(scene) or not all(is_aimed(one) for one in each):
+        return
+    if any(is_traced(one) and one.source.rays is not None for one in each):  # whose rays are not aimed at the exit
         return
     goal, most, lit = _lit(scene, target), -1.0, False
-    for x, y, d in chain(*(_in_glass(one, max(1, PAIRS // goal.shape[1])) for one in scene.by_source)):
-        lit = lit or len(x) > 0
-        most = max(most, _largest_cosine(scene, x, y, d, goal))
+    for count, at, d in chain(*(_at_exit(one, max(1, PAIRS // goal.shape[1])) for one in each)):
+        lit = lit or count > 0
+        most = max(most, _largest_cosine(at, d, goal))
         if lens.inside * most > 1.0:
             return
     if not lit:
@@ -65,17 +71,38 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
     )
 
 
-def _largest_cosine(scene: Scene, x: np.ndarray, y: np.ndarray, d: np.ndarray, goal: np.ndarray) -> float:
-    """Largest cosine of a deflection from rays in the glass, as of `_in_glass`, to points of the picture (3, m); at least -1."""
-    lens, most = scene.lens, -1.0
-    for height in (lens.offset.thickness, lens.z_in + lens.min_thickness):
-        over = (height - lens.z_in) / d[2]
-        at = np.stack([x + over * d[0], y + over * d[1], np.full_like(x, height)])
-        within = (np.abs(at[0]) <= lens.half_size[0]) & (np.abs(at[1]) <= lens.half_size[1])
-        if within.any():
-            t = goal[:, None, :] - at[:, within, None]
-            most = max(most, float(((t * d[:, within, None]).sum(0) / np.sqrt((t * t).sum(0)))[t[2] > 0].max(initial=-1.0)))
-    return most
+def _largest_cosine(at: np.ndarray, d: np.ndarray, goal: np.ndarray) -> float:
+    """Largest d . t of rays (3, k) at points (3, k) of the exit, as of `_at_exit`, to points of the picture (3, m); at least -1."""
+    t = goal[:, None, :] - at[:, :, None]
+    return float(((t * d[:, :, None]).sum(0) / np.sqrt((t * t).sum(0)))[t[2] > 0].max(initial=-1.0))
+
+
+def _at_exit(scene: Scene, rays: int) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Rays that fall on the lens, their number, and of those that arrive at the heights of the exit within its aperture points
+    (3, k), mm, and directions (3, k), of the length of the index there over that of the lens; about `rays` rays at a time."""
+    lens = scene.lens
+    heights = lens.offset.thickness, lens.z_in + lens.min_thickness
+    if is_traced(scene):
+        x, y = _grid(scene)
+        for height, mode in product(heights, (central_mode(scene), *outermost_modes(scene))):
+            at = np.stack([x, y, np.full_like(x, height)])
+            d, lit = directions(from_point(scene, offset(scene.source, mode.position)), at)
+            yield int(lit.sum()), at[:, lit], d[:, lit]
+        return
+    for x, y, d in _in_glass(scene, rays):
+        for height in heights:
+            over = (height - lens.z_in) / d[2]
+            at = np.stack([x + over * d[0], y + over * d[1], np.full_like(x, height)])
+            within = (np.abs(at[0]) <= lens.half_size[0]) & (np.abs(at[1]) <= lens.half_size[1])
+            yield len(x), at[:, within], d[:, within]
+
+
+def _grid(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Points x, y (k,) of the aperture, mm."""
+    lens = scene.lens
+    x, y = (c.ravel() for c in np.meshgrid(*(np.linspace(-h, h, ENTRANCE) for h in lens.half_size), indexing="ij"))
+    inside = np.all([far <= r * (1.0 + 1e-9) for far, r in lens.opening.distances(x, y)], axis=0)
+    return x[inside], y[inside]
 
 
 def largest_magnification(scene: Scene, picture: Sequence[float]) -> float | None:
@@ -108,9 +135,7 @@ def _in_glass(scene: Scene, rays: int) -> Iterator[tuple[np.ndarray, np.ndarray,
             x, y, dx, dy, dz = (torch.as_tensor(c).numpy() for c in (*state.origin[:2], *state.direction))
             yield _refracted(scene, x, y, dx / dz, dy / dz)
         return
-    x, y = (c.ravel() for c in np.meshgrid(*(np.linspace(-h, h, ENTRANCE) for h in lens.half_size), indexing="ij"))
-    inside = np.all([far <= r * (1.0 + 1e-9) for far, r in lens.opening.distances(x, y)], axis=0)
-    x, y = x[inside], y[inside]
+    x, y = _grid(scene)
     if source.distant:
         sine = math.sin(source.half_angle)
         a, b = (sine * c[:, None] for c in AROUND)

@@ -16,9 +16,8 @@ E is taken on the offset surface.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 
@@ -26,14 +25,13 @@ import numpy as np
 import torch
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.incidence import directions
+from caustic_cli.inverse.incidence import directions, from_point
 from caustic_cli.inverse.projection import ScreenProjection
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.optics.emission.coherent import offset, outermost_modes
-from caustic_cli.optics.frames import turned_about
 from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.optics.spread import Spread
-from caustic_cli.scene import PlaneWave, Points, Scene, Source
+from caustic_cli.scene import Scene, Source
 from caustic_cli.scene.traits import Capability
 
 SOURCE_IMAGES = Capability(
@@ -236,16 +234,7 @@ def _unturned(matrices: np.ndarray) -> np.ndarray:
 def _arriving(scene: Scene, exit: np.ndarray, moved: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """`directions` (N, 1, 3) in front of the exit at points (3, N) of it, of light from a point of the source that is displaced by
     `moved` from its centre, and whether there is such light, (N, 1)."""
-    source = scene.source
-    point: Source
-    if source.distant:
-        length = math.sqrt(1.0 - moved[0] ** 2 - moved[1] ** 2)
-        x, y, z = (length * c for c in turned_about(source.axis, *(m / length for m in moved)))
-        point = PlaneWave(tilt=(math.degrees(-math.asin(y)), math.degrees(math.atan2(x, z))))
-    else:
-        x, y, z = source.centre
-        point = Points(((x + moved[0], y + moved[1], z),))
-    d, lit = directions(replace(scene, source=point), exit)
+    d, lit = directions(from_point(scene, moved), exit)
     return d.T[:, None], lit[:, None]
 
 
