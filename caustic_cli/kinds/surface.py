@@ -188,8 +188,8 @@ class OneSurface(Problem):
     @classmethod
     def default_start(cls, d: Defaults) -> str:
         """The initial surface unless one is given."""
-        one = d.source.by_lenslet or not d.source.apart or d.shifts
-        return "transport" if d.from_surface and cls.fine_net(d) and one else "offset"
+        able = d.from_surface and cls.fine_net(d)
+        return "transport" if able and (d.source.by_lenslet or not d.source.apart or d.shifts) else "offset"
 
     @classmethod
     def refuse_settings(cls, d: Defaults) -> None:
