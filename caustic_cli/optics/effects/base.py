@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any, TypeAlias
 
 from torch import Tensor
 
@@ -19,8 +19,8 @@ from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Scene
 
-if TYPE_CHECKING:  # a trace takes no bounds, and does not load them
-    from caustic_cli.optics.bounds import Bounds
+#: A `bounds.Bounds`: a trace takes none, and these are partly found by one.
+Bounds: TypeAlias = Any
 
 #: Fraction of the source's power below which stray light is neglected: the models of other effects are no more accurate.
 NEGLIGIBLE = 0.01
