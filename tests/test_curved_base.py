@@ -24,6 +24,7 @@ from caustic_cli.inverse import relief
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.io.faces import read_face
+from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.effects.base import Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.parallel import beyond_aperture, parallel_side
@@ -402,6 +403,18 @@ def test_four_axes_are_for_the_outside_of_a_cylinder(tmp_path):
         write_gcode(tmp_path / "r.nc", part_of("gcode", tube, *on_base(tube)), Milling(path="rotary", stock=29.0, scallop=0.1))
 
 
+@pytest.mark.parametrize("radius", [TUBE, (-14.0, -14.0), BOWL])
+def test_exit_is_compared_with_its_curved_entrance(radius):
+    """A convex wall lies below its inner vertex at the rim, and a concave one above it."""
+    scene = scene_of(radius)
+    field, base = on_base(scene)
+    x, y = (np.linspace(-r, r, 97) for r in HALF)
+    wall = scene.lens.offset.heights(x, y) - Offset(0.0, tuple(r + WALL for r in radius)).heights(x, y)  # concentric
+    check_exit_above_entrance(scene, field, base - wall.min() + 0.02)
+    with pytest.raises(InputError, match=r"dips 0.0[12].* mm below"):
+        check_exit_above_entrance(scene, field, base - wall.min() - 0.02)
+
+
 # Commands
 
 
@@ -436,6 +449,17 @@ def tube(tmp_path_factory):
         == 0
     )
     return folder / "t"
+
+
+def test_steep_wall_is_as_thick_as_by_default_and_opened_again(tmp_path):
+    """Its rim lies 5.8 mm below the vertex, its inner side 3 mm below that."""
+    write_blob(blob := tmp_path / "blob.png")
+    how = ["--base-radius=-20", "--lens-size", 20, "--entrance", "parallel", "--throw", 100, "--control", 12, "--resolution", 16]
+    assert run("design", blob, *how, "--iterations", 1, "--rays", 2000, "--start", "offset", "--out", tmp_path / "d") == 0
+    made = load(tmp_path / "d").scene.lens
+    assert made.offset.thickness - made.z_in == pytest.approx(WALL)
+    assert run("export", tmp_path / "d", "--format", "lighttools", "--out", tmp_path / "d.npz", "--quiet") == 0
+    assert run("render", tmp_path / "d.npz", "--rays", 2000, "--out", tmp_path / "r", "--quiet") == 0
 
 
 def test_design_keeps_the_limits_and_the_wall(tube):

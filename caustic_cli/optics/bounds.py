@@ -68,19 +68,20 @@ class Bounds:
 
 
 def check_exit_above_entrance(scene: Scene, field: HeightField, heights: Tensor) -> None:
-    """Check that the exit lies nowhere below the plane z_in: absorption over a negative thickness would amplify light.
+    """Check that the exit lies nowhere below the entrance: absorption over a negative thickness would amplify light.
 
     Raises:
         InputError: giving the depth by which it does.
     """
-    lens = scene.lens
-    if float(heights.min()) >= lens.interaction.base(lens.z_in):  # the convex hull of the net contains the surface
+    lens, curved = scene.lens, scene.lens.entrance
+    top = 0.0 if curved is None else float(curved.heights.max())
+    if float(heights.min()) >= lens.interaction.base(lens.z_in) + top:  # the convex hulls of the nets contain the surfaces
         return
-    dip = lens.z_in - field.least(heights, lens.opening)
+    dip = lens.z_in - field.least(heights, lens.opening, curved)
     if dip > 0:
         raise InputError(
-            f"⟨lens.z_in⟩ of {lens.z_in:g} mm lies above a part of the exit surface, which dips {dip:.3g} mm below it; it must"
-            f" be at most {at_most(lens.z_in - dip, 6)} mm"
+            f"the entrance from ⟨lens.z_in⟩ of {lens.z_in:g} mm lies above a part of the exit surface, which dips {dip:.3g} mm"
+            f" below it; it must be at most {at_most(lens.z_in - dip, 6)} mm"
         )
 
 

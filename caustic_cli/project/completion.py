@@ -205,10 +205,11 @@ def complete_lens(s: Settings, source: Source) -> LensSettings:
 def _missing_room(lens: LensSettings) -> float:
     """Increase of the thickness, mm, with which the base surface keeps the least thickness; 0 if the heights have room already.
 
-    A strongly converging lens, for a close source for instance, is thinnest at its corners.
+    A strongly converging lens, for a close source for instance, is thinnest at its corners; a wall is equally thick everywhere.
     """
     x, y = (np.array([0.0, width / 2.0]) for width in lens.size)
-    lowest = lens.thickness + float(build_base(lens).sag(x[:, None], y[None, :]).min())
+    sag = build_base(lens).sag(x[:, None], y[None, :]) if lens.entrance == "flat" else np.zeros(1)
+    lowest = lens.thickness + float(sag.min())
     short = interaction_of(lens.mirror).base(lens.z_in) + lens.min_thickness - lowest
     return short if short >= lens.height_range[1] else 0.0
 

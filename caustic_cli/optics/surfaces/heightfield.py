@@ -24,7 +24,7 @@ from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.bspline import SplineSpace, over_grid
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
-from caustic_cli.scene import Aperture, Lens
+from caustic_cli.scene import Aperture, FreeForm, Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,12 +114,14 @@ class HeightField(Surface[Tensor]):
         low, high = torch.aminmax(heights.detach())
         return float(low), float(high)
 
-    def least(self, heights: Tensor, aperture: Aperture) -> float:
-        """Least height over an aperture of its half widths, mm, sampled at 8 points per knot span, at most 4001 along an axis,
-        including the corners and the centre."""
+    def least(self, heights: Tensor, aperture: Aperture, above: FreeForm | None = None) -> float:
+        """Least height over an aperture of its half widths, mm, or above a surface over the same half widths, sampled at 8 points
+        per knot span, at most 4001 along an axis, including the corners and the centre."""
         points = [torch.linspace(0.0, 1.0, min(4001, 8 * (len(s.breaks) - 1) + 1), dtype=torch.float64) for s in self.spaces]
         u, v = (s.banded(p) for s, p in zip(self.spaces, points, strict=True))
         z = over_grid(u, heights.detach().double().cpu(), v)
+        if above is not None:
+            z = z - torch.from_numpy(above.at(*(2.0 * p.numpy() - 1.0 for p in points)))
         return float(z[aperture.covers(2.0 * points[0][:, None] - 1.0, 2.0 * points[1][None, :] - 1.0)].min())
 
     def on_grid(self, heights: Tensor, shape: tuple[int, int]) -> Tensor:
