@@ -488,6 +488,28 @@ def test_by_the_command_line(tmp_path, monkeypatch, capfd):
     assert code == 0
 
 
+def test_pictures_by_rays_and_by_waves_show_irradiance(tmp_path, monkeypatch, capfd):
+    """On a cylinder: the power of a pixel is the same by both, as are the codes of what is shown, power over area, which is up to
+    1.5 times as large at the edges of the light as in the middle."""
+    monkeypatch.chdir(tmp_path)
+    light = np.ones((12, 12))
+    light[6, 6] = 4.0  # white, beside which the rest is not cut off
+    np.save("light.npy", light)
+    lens = ["--lens-size", "4", "--mag", "1.45", "--throw", "40", "--screen-radius=-4,inf", "--resolution", "12", "--control", "10"]
+    how = ["--start", "offset", "--iterations", "1", "--waves", "off", "--quiet", "-o", "c.caustic"]
+    assert run(capfd, "design", "light.npy", *lens, *how)[0] == 0
+    how = ["--effects", "diffraction", "--rays", "400000", "--npy", "c.npy", "-o", "c.png", "--quiet"]
+    assert run(capfd, "render", "c.caustic", *how)[0] == 0
+    by_rays, by_waves = np.load("c.npy"), np.load("c-wave.npy")
+    assert np.abs(by_rays - by_waves).max() < 0.02 * by_rays.max()
+    codes = [np.asarray(Image.open(name).convert("L"), float)[::-1].T for name in ("c.png", "c-wave.png")]  # [i, j]
+    assert np.abs(codes[0] - codes[1]).max() < 6
+    x = 2.0 * 1.45 * 1.28 * ((np.arange(12) + 0.5) / 6.0 - 1.0)
+    lit = by_waves[:, 6] > 0.3 * by_waves.max()
+    density = by_waves[lit, 6] * np.sqrt(1.0 - (x[lit] / 4.0) ** 2)
+    assert codes[1][lit, 6] / codes[1][lit, 6].max() == pytest.approx(density / density.max(), abs=0.02)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

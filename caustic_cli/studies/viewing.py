@@ -10,6 +10,7 @@ from caustic_cli.loading import OnDemand
 from caustic_cli.optics.image import Image
 from caustic_cli.scene import Scene
 from caustic_cli.studies.color_error import shown
+from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.retrace import white_level
 
 if TYPE_CHECKING:
@@ -39,6 +40,17 @@ def as_viewed(
         return shown(scene.light, image, target), 1.0
     white = white_level(image, target)
     return (image if xyz is None or scene is None else in_colour(scene, xyz, white)), white
+
+
+def as_lit(
+    scene: Scene | None, image: np.ndarray, target: np.ndarray | None, xyz: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
+    """`as_viewed` of images of power per pixel: their irradiance on the screen."""
+    if scene is None:
+        return as_viewed(scene, image, target, xyz)
+    seen, aim, colour = (None if a is None else irradiance(a, scene.screen) for a in (image, target, xyz))
+    assert seen is not None
+    return as_viewed(scene, seen, aim, colour)
 
 
 def in_colour(scene: Scene, xyz: np.ndarray, white: float) -> np.ndarray:

@@ -23,7 +23,7 @@ from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.retrace import evaluation_rays, retrace
-from caustic_cli.studies.viewing import as_viewed, in_colour
+from caustic_cli.studies.viewing import as_lit, as_viewed, in_colour
 
 design_report, by_waves = OnDemand("caustic_cli.studies.design_report"), OnDemand("caustic_cli.studies.waves")
 
@@ -46,19 +46,20 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
         return evaluated
     encoding = project.settings.target.encoding
     scene, screen = designer.scene, designer.scene.screen
-    seen, aim = (irradiance(a, screen) for a in (evaluated.image, target))
-    xyz = None if evaluated.xyz is None else irradiance(evaluated.xyz, screen)
     made = uptodate.image_provenance(project, evaluated.state.heights, evaluated.figures)
-    write_image(project.path / RENDER, *as_viewed(scene, seen, aim, xyz), encoding, WIDE, made)
+    write_image(project.path / RENDER, *as_lit(scene, evaluated.image, target, evaluated.xyz), encoding, WIDE, made)
     discard(project.path / WAVE)  # of an earlier lens
     if evaluated.waves is not None:
-        write_image(project.path / WAVE, *as_viewed(scene, evaluated.waves, target, evaluated.waves_xyz), encoding, WIDE)
+        write_image(project.path / WAVE, *as_lit(scene, evaluated.waves, target, evaluated.waves_xyz), encoding, WIDE)
     discard(project.path / FARTHER)
     if evaluated.farther is not None:
         write_image(project.path / FARTHER, *as_viewed(scene, *evaluated.farther), encoding, WIDE)
     if not designer.problem.effort.report:
         return evaluated
     history = np.array(state.history, dtype=float).reshape(-1, 5)
+    images = (target, evaluated.image, evaluated.waves, evaluated.xyz, evaluated.waves_xyz)
+    aim, seen, waves, *colours = (None if a is None else irradiance(a, screen) for a in images)
+    assert aim is not None and seen is not None
     surface = _surface(designer.field(evaluated.state.stage), designer.exit(evaluated.state))
     design_report.write_report(
         project.path / REPORT,
@@ -70,11 +71,11 @@ def evaluate_and_write(project: Project, designer: Designer, state: State, timed
         screen,
         evaluated.figures,
         encoding,
-        None if evaluated.waves is None else grey(evaluated.waves),
+        None if waves is None else grey(waves),
         [(stage.rendering.blur, bool(stage.waves)) for stage in designer.stages],
         [(row.seconds, row.error) for row in state.accuracy],
         price(state.accuracy),
-        [None if a is None else partial(in_colour, scene, a) for a in (xyz, evaluated.waves_xyz)],
+        [None if a is None else partial(in_colour, scene, a) for a in colours],
     )
     return evaluated
 

@@ -18,9 +18,8 @@ from caustic_cli.inverse.target import grey
 from caustic_cli.io.picture import codes_of
 from caustic_cli.loading import OnDemand
 from caustic_cli.scene import Scene
-from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.studies.viewing import as_viewed, separated
+from caustic_cli.studies.viewing import as_lit, separated
 from caustic_cli.workflow.reporter import Reporter
 
 movies = OnDemand("caustic_cli.io.movie")
@@ -122,10 +121,8 @@ class Movie(NoMovie):
 
     def _add(self, image: np.ndarray, *words: str) -> None:
         target, scene = self._target, self.scene
-        if scene is not None:
-            image, target = irradiance(image, scene.screen), None if target is None else irradiance(target, scene.screen)
         seen, xyz = separated(scene, image)
-        self.frames.append(Frame(codes_of(*as_viewed(scene, seen, target, xyz), self._encoding), (words[0], words[1])))
+        self.frames.append(Frame(codes_of(*as_lit(scene, seen, target, xyz), self._encoding), (words[0], words[1])))
 
 
 def recorder(path: Path | None, force: bool) -> NoMovie:

@@ -11,6 +11,7 @@ from caustic_cli.effort import current_effort
 from caustic_cli.inverse.lenslets import lenslets
 from caustic_cli.io.picture import write_image
 from caustic_cli.loading import OnDemand
+from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.retrace import white_level
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 from caustic_cli.workflow.reporter import Reporter
@@ -45,6 +46,7 @@ class Hours(Output):
                 rendering.seed,
             )
         n, m = scene.lens.array
+        images, targets = ([irradiance(a, scene.screen) for a in each] for each in (images, targets))
         sheet = np.concatenate([np.concatenate(images[i * m : (i + 1) * m], 1) for i in range(n)], 0)
         wanted = np.concatenate([np.concatenate(targets[i * m : (i + 1) * m], 1) for i in range(n)], 0)
         (path,) = self.paths(rendering.place)

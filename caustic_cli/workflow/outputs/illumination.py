@@ -19,7 +19,7 @@ from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.brightness import brightness
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import retrace
-from caustic_cli.studies.viewing import as_viewed
+from caustic_cli.studies.viewing import as_lit
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
 from caustic_cli.workflow.photographs import CHANNELS
@@ -76,7 +76,7 @@ class Illumination(Output):
             residuals.append(solved.residual)
         level /= level.max()
         seen = (basis @ level[..., None]).reshape(self.target.shape)
-        shown, white = as_viewed(scene, seen, self.target)
+        shown, white = as_lit(scene, seen, self.target)
         write_image(path, shown, white, rendering.lens.encoding)
         by_lenslet = level.reshape(*self.target.shape[:-2], *scene.lens.array)
         found = {

@@ -7,8 +7,7 @@ from typing import Any
 
 from caustic_cli.io.picture import said_of, write_image
 from caustic_cli.project.uptodate import image_provenance
-from caustic_cli.studies.irradiance import irradiance
-from caustic_cli.studies.viewing import as_viewed
+from caustic_cli.studies.viewing import as_lit
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
 #: Ratio of the noise of an existing image to that of a new one below which the existing one is kept.
@@ -35,9 +34,6 @@ class RayPicture(Output):
                 " replaces it, ⟨out⟩ writes another beside it"
             )
             return {"image_kept": True}
-        shown, xyz, aim = (
-            None if a is None else irradiance(a, lens.scene.screen) for a in (rendering.image, rendering.xyz, lens.target)
-        )
-        assert shown is not None
-        write_image(place.image, *as_viewed(lens.scene, shown, aim, xyz), lens.encoding, place.wide, own)
+        seen = as_lit(lens.scene, rendering.image, lens.target, rendering.xyz)
+        write_image(place.image, *seen, lens.encoding, place.wide, own)
         return {}

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 from caustic_cli.io.picture import WIDE, write_image, write_npy
 from caustic_cli.scene.traits import Capability
+from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.photograph import comparison
 from caustic_cli.studies.viewing import as_viewed
 from caustic_cli.workflow.lens import Lens
@@ -52,7 +53,8 @@ class PartPhotograph(Output):
         shown, aim = found.shown[0], found.targets[0]
         made, deviation = comparison.surfaces(found.found)
         image, values, missing, plot, part, off = paths
-        write_image(image, *as_viewed(found.scenes[0], found.of_first, lens.target), lens.encoding, WIDE)
+        as_designed = irradiance(lens.target, lens.scene.screen)
+        write_image(image, *as_viewed(found.scenes[0], found.of_first, as_designed), lens.encoding, WIDE)
         write_npy(values, found.of_first)
         write_image(missing, shown.missing, float(aim.max() / aim.mean()), lens.encoding, WIDE)
         comparison.write_plot(plot, shown, aim, found.found, lens.encoding)

@@ -10,7 +10,7 @@ from caustic_cli.io.picture import write_image
 from caustic_cli.optics.plan import parse_effects
 from caustic_cli.project.project import WAVE, beside
 from caustic_cli.studies.metrics import judged
-from caustic_cli.studies.viewing import as_viewed
+from caustic_cli.studies.viewing import as_lit
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
 
@@ -34,7 +34,7 @@ class WavePicture(Output):
             )
         image, figures = found
         if image.size:
-            write_image(path, *as_viewed(lens.scene, image, lens.target, found.xyz), lens.encoding, place.wide)
+            write_image(path, *as_lit(lens.scene, image, lens.target, found.xyz), lens.encoding, place.wide)
             rendering.waves, rendering.waves_xyz = image, found.xyz
             figures = figures | {"wave_image": str(path)}
         return judged(rendering.figures | figures, lens.by_waves or "diffraction" in (parse_effects(effects) or ()))
