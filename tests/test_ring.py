@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import write_blob
+from scipy.interpolate import NdBSpline
 
 from caustic_cli import cli
 from caustic_cli.errors import InputError
@@ -22,9 +23,10 @@ from caustic_cli.export.milling.gcode import write_gcode
 from caustic_cli.export.panels import Panels
 from caustic_cli.export.part import part_of
 from caustic_cli.export.ring import ring_of
+from caustic_cli.export.stl import write_mesh
 from caustic_cli.optics.parallel import parallel_side
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.workflow.machining import cut_surface
 
 INF, WALL = math.inf, 3.0
@@ -240,7 +242,7 @@ def test_command_writes_rings(tmp_path, monkeypatch, capsys):
     write_blob(tmp_path / "blob.png")
     how = "--base-radius=-10,inf --entrance parallel --relief=-0.4,0 --mag 1.2 --throw 200 --lens-size 10x6 --start transport"
     few = "--control 16 --resolution 24 --iterations 1 --waves off --quiet"
-    for name, more in (("a", ""), ("b", "--flip x")):
+    for name, more in (("a", ""), ("b", "--flip x"), ("c", "--index 1.6")):
         assert cli.run(["design", "blob.png", *f"{how} {few} {more} --out {name}.caustic".split()]) == 0
     capsys.readouterr()
     order = "b.caustic,a.caustic,b.caustic,a.caustic,b.caustic"
@@ -260,7 +262,109 @@ def test_command_writes_rings(tmp_path, monkeypatch, capsys):
         "1 --format stl": "at least 3 panels",
         "100000000 --format stl": "at most 360",
         "none.caustic --format stl": "none.caustic",
+        "a.caustic,a.caustic,a.caustic,a.caustic,c.caustic --format stl": "same material",
     }
     for options, words in refused.items():
         assert cli.run(["export", "a.caustic", "--ring", *options.split()]) == 2
         assert words in capsys.readouterr().err
+
+
+# light
+
+
+def bent_by(d, normal, ratio):
+    """Unit directions (N, 3) behind a surface with unit normals (N, 3) by Snell's law; ratio of the indices before and behind."""
+    normal = normal * np.sign((d * normal).sum(1))[:, None]
+    cosine = (d * normal).sum(1)[:, None]
+    return ratio * d + (np.sqrt(1.0 - ratio**2 * (1.0 - cosine**2)) - ratio * cosine) * normal
+
+
+def first_met(corners, normals, o, d):
+    """Distances (N,) to the first triangle (T, 3, 3) that rays meet (Möller and Trumbore, 1997), and the unit normal there, (N, 3),
+    between those of its corners (T, 3, 3)."""
+    a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    far, found = np.full(len(o), INF), np.zeros((len(o), 3))
+    for k in range(len(o)):
+        p, s = np.cross(d[k], v), o[k] - a
+        q, over = np.cross(s, u), (u * p).sum(1)
+        over = 1.0 / np.where(over == 0.0, INF, over)
+        b, c, t = (s * p).sum(1) * over, (q @ d[k]) * over, (v * q).sum(1) * over
+        t = np.where((b >= -1e-9) & (c >= -1e-9) & (b + c <= 1.0 + 1e-9) & (t > 1e-6), t, INF)
+        first = t.argmin()
+        far[k] = t[first]
+        found[k] = np.array([1.0 - b[first] - c[first], b[first], c[first]]) @ normals[first]
+    return far, found / np.linalg.norm(found, axis=1)[:, None]
+
+
+def smoothed(corners):
+    """Normals (T, 3, 3) at the corners of triangles (T, 3, 3): means over those that share a corner, by their areas."""
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    _, point = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    total = np.zeros((point.max() + 1, 3))
+    np.add.at(total, point.ravel(), np.repeat(area, 3, axis=0))
+    return (total / np.linalg.norm(total, axis=1)[:, None])[point.ravel()].reshape(-1, 3, 3)
+
+
+def landing_of(scene, heights, o, d):
+    """Landing points (N, 2) of rays (N, 3) through a concentric inner side and a spline of SciPy, by Newton's method."""
+    lens = scene.lens
+    bent, axis, half = int(math.isinf(lens.offset.radius[0])), WALL + min(lens.offset.radius), np.array(lens.half_size)
+    spline = NdBSpline(
+        tuple(np.r_[np.zeros(3), np.linspace(0.0, 1.0, n - 2), np.ones(3)] for n in lens.control), heights.numpy(), 3
+    )
+    section = np.ones(3)
+    section[1 - bent] = 0.0
+    from_axis, across = (o - [0.0, 0.0, axis]) * section, d * section
+    a, b, c = (across**2).sum(1), (from_axis * across).sum(1), (from_axis**2).sum(1) - (min(lens.offset.radius) + WALL) ** 2
+    o = o + ((np.sqrt(b * b - a * c) - b) / a)[:, None] * d
+    normal = (o - [0.0, 0.0, axis]) * section
+    d = bent_by(d, normal / np.linalg.norm(normal, axis=1)[:, None], 1.0 / lens.index)
+
+    def at(x, nu=(0, 0)):
+        return spline(0.5 * (x / half + 1.0), nu=nu) / np.prod((2.0 * half) ** np.array(nu))
+
+    t = np.full(len(o), WALL)
+    for _ in range(30):
+        x = o[:, :2] + t[:, None] * d[:, :2]
+        slopes = at(x, (1, 0)), at(x, (0, 1))
+        t = t - (o[:, 2] + t * d[:, 2] - at(x)) / (d[:, 2] - slopes[0] * d[:, 0] - slopes[1] * d[:, 1])
+    o = o + t[:, None] * d
+    normal = np.stack([-at(o[:, :2], (1, 0)), -at(o[:, :2], (0, 1)), np.ones(len(o))], 1)
+    d = bent_by(d, normal / np.linalg.norm(normal, axis=1)[:, None], lens.index)
+    return (o + ((scene.screen.z - o[:, 2]) / d[:, 2])[:, None] * d)[:, :2]
+
+
+def about(bent, angle, axis, points):
+    """Points (N, 3) turned about the ring's axis, from z towards the coordinate with curvature."""
+    found, up = points.copy(), points[:, 2] - axis
+    found[:, bent] = points[:, bent] * math.cos(angle) + up * math.sin(angle)
+    found[:, 2] = axis + up * math.cos(angle) - points[:, bent] * math.sin(angle)
+    return found
+
+
+@pytest.mark.parametrize("radius", [(-10.0, INF), (INF, -10.0)])
+def test_every_panel_of_a_file_throws_the_picture_of_its_design(radius, tmp_path):
+    """A lamp on the axis: its rays through the triangles of the STL file, smoothed, land as those of the panel by itself, turned
+    with it, through SciPy's spline and a concentric inner side, and not as those of the other panel.  Finer triangles, nearer."""
+    part, sides = ring_part(radius)
+    ring = ring_of(Panels.of(part, part.others), part.lens, 10)
+    write_mesh(tmp_path / "ring.stl", ring.vertices, ring.faces)
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    corners = np.frombuffer((tmp_path / "ring.stl").read_bytes()[84:], record)["corners"].astype(float)
+    normals, count = smoothed(corners), 10
+    bent, axis, rng = int(math.isinf(radius[0])), WALL + min(radius), np.random.default_rng(5)
+    o, d = np.tile([0.0, 0.0, axis], (count, 1)), np.ones((count, 3))
+    d[:, bent], d[:, 1 - bent] = rng.uniform(-0.45, 0.45, count), rng.uniform(-0.12, 0.12, count)
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    scene = replace(part.scene, source=Points(((0.0, 0.0, axis),)))
+    for k in (0, 1, 5):
+        turn = math.radians(60.0 * k)
+        p, end = (about(bent, turn, axis, points) for points in (o, o + d))
+        way = end - p
+        for ratio in (1.0 / 1.49, 1.49):
+            t, normal = first_met(corners, normals, p, way)
+            p, way = p + t[:, None] * way, bent_by(way, normal, ratio)
+        p, end = (about(bent, -turn, axis, points) for points in (p, p + way))
+        found = (p + ((scene.screen.z - p[:, 2]) / (end - p)[:, 2])[:, None] * (end - p))[:, :2]
+        own, other = (np.sqrt(((found - landing_of(scene, sides[j][1], o, d)) ** 2).mean()) for j in (ORDER[k], 1 - ORDER[k]))
+        assert own < 0.4 and other > 5.0

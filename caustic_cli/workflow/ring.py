@@ -98,11 +98,11 @@ def _refuse_other_base(path: Path, lens: Lens, first: Lens) -> None:
     """Refuse a panel that does not stand beside the first.
 
     Raises:
-        InputError: its base, inner side or size is another.
+        InputError: its base, inner side, size or material is another.
     """
-    its, wanted = ((n.offset, n.size, n.z_in, n.aperture, n.entrance is None) for n in (lens, first))
+    its, wanted = ((n.offset, n.size, n.z_in, n.aperture, n.entrance is None, n.index, n.glass) for n in (lens, first))
     if its != wanted:
         raise InputError(
-            f"{path}: panels of a ring need the same base (⟨lens.radius⟩), ⟨lens.size⟩, ⟨lens.thickness⟩ and inner side"
-            " (⟨lens.entrance⟩)"
+            f"{path}: panels of a ring need the same base (⟨lens.radius⟩), ⟨lens.size⟩, ⟨lens.thickness⟩, inner side"
+            " (⟨lens.entrance⟩) and the same material (⟨lens.index⟩)"
         )
