@@ -119,6 +119,7 @@ LONG = (
     "test_a_corrected_part_is_better_by_the_stated_amount",
     "test_the_simulated_cut_is_that_of_the_arcs[simple-inch]",
     "test_corners_and_the_picture_itself_find_the_screen_too",
+    "test_a_fit_that_ends_on_another_surface_is_said",
     "test_a_folded_caustic_is_inferred_within_what_is_said",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.001-0.05-1]",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.003-0.25-3]",

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from datetime import datetime, timedelta
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,10 +20,12 @@ from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Scre
 from caustic_cli.scene.room import Room
 from caustic_cli.scene.room_screen import placed
 from caustic_cli.scene.screen import tilted
+from caustic_cli.scene.sources.gaussian import Gaussian
+from caustic_cli.scene.sources.measured_beam import MeasuredBeam
 from caustic_cli.scene.sources.several import Several
 from caustic_cli.scene.sunlight import Sunlight, moment
 from caustic_cli.studies import day as study
-from caustic_cli.studies.day import Day, Follower, Instant, follow_day, hours_of_sun, moved, smoothed
+from caustic_cli.studies.day import Day, Follower, Instant, _under, follow_day, hours_of_sun, moved, smoothed
 
 MUNICH, DATE = (48.14, 11.58), "2026-12-21"
 NOON = moment(f"{DATE}T12:00+01:00")
@@ -138,6 +141,12 @@ def test_lamps_stand_still_beside_the_sun():
     coarse = [a.reshape(6, 10, 6, 10).sum((1, 3)) for a in (5.0 * seen.around, watts)]
     assert coarse[0] == pytest.approx(coarse[1], abs=0.01 * coarse[1].max()) and watts.sum() > 2.5
     assert follower.white.sum() == pytest.approx(target.sum(), rel=0.02)
+
+
+@pytest.mark.parametrize("laser", [Gaussian((3.0, 3.0), 633.0), MeasuredBeam(np.zeros((5, 5)), 633.0)])
+def test_lasers_stand_still_beside_the_sun(laser):
+    both = Several((PlaneWave(), laser), (((), ()), ((), ()))).each(partial(_under, (20.0, 0.0)))
+    assert both.members[0].oblique and both.members[1] is laser
 
 
 def test_periods():

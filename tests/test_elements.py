@@ -40,6 +40,7 @@ from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces import HeightField, Sphere
+from caustic_cli.optics.surfaces.facets import FacetSurface
 from caustic_cli.optics.system import ENTRANCE, EXIT, PlacedScreen, System, split_heights
 from caustic_cli.optics.trace import Tracer, expose, render
 from caustic_cli.optics.waves.image import wave_image
@@ -831,3 +832,13 @@ def test_a_scene_without_elements_is_as_it_was():
     assert scene.pupil.z == LENS.z_in and scene.axial and not scene.joint and System.of(scene, FIELD).leg is None
     rays = next(iter(rays_of(scene, "lines", 4_000).chunks()))
     assert Tracer(System.of(scene, FIELD), rays).fused is not None
+
+
+def test_measured_surfaces_stand_among_other_elements():
+    """As the facets of an exported mesh, which have no splines: exports and simulated cuts are judged by them."""
+    scene = replace(SCENE, elements=(thick(40.0), mirror(90.0, (0.0, 45.0))), screen=replace(SCREEN, z=150.0))
+    x, y = np.meshgrid(np.linspace(-5.0, 5.0, 9), np.linspace(-5.0, 5.0, 9), indexing="ij")
+    facets = FacetSurface(np.stack([x, y, np.full_like(x, 5.0)], -1))
+    flat = torch.full(FIELD.shape, 5.0, dtype=torch.float64)
+    images = [expose(scene, surface, flat, rays_of(scene, "grid", 4000)).image for surface in (facets, FIELD)]
+    assert images[0].numpy() == pytest.approx(images[1].numpy(), abs=1e-7) and float(images[1].sum()) > 0.9

@@ -119,10 +119,9 @@ def freeform_of(field: HeightField, heights: Tensor) -> FreeForm:
     return FreeForm(heights.detach().cpu().double().numpy(), (u.degree, v.degree), (u.knots.tolist(), v.knots.tolist()))
 
 
-def _elements_of(
-    component: Component, number: int, leg: AxisSegment, scene: Scene, spaces: tuple[SplineSpace, SplineSpace]
-) -> list[Element]:
-    """The surfaces of a component on an axis segment; a free surface without heights uses these spline spaces."""
+def _elements_of(component: Component, number: int, leg: AxisSegment, scene: Scene, exit: HeightField) -> list[Element]:
+    """The surfaces of a component on an axis segment; a free surface without heights uses the spline spaces of the exit, which has
+    some where a lens is designed."""
     elements, glass = [], Medium(component.index, component.absorption, component.glass)
     for side in component.sides:
         front, radius = component.surfaces[SIDES.index(side)], component.radius[SIDES.index(side)]
@@ -130,7 +129,7 @@ def _elements_of(
         if front is not None:
             surface = fixed_surface(front, component.half_size)
         elif side in component.free_sides:
-            surface = HeightField(spaces, component.half_size)
+            surface = HeightField(exit.spaces, component.half_size)
         else:
             surface = Sphere(radius, component.reach) if math.isfinite(radius) else Plane()
         pose = leg.pose(component.vertex(side), component.tilt)
@@ -205,7 +204,7 @@ class System:
             )
             elements = (first, *elements)
         lit, leg = None if scene.two_sided or scene.in_front else scene.pupil, AxisSegment()
-        in_front = tuple(e for k, c in enumerate(scene.in_front) for e in _elements_of(c, k, leg, scene, surface.spaces))
+        in_front = tuple(e for k, c in enumerate(scene.in_front) for e in _elements_of(c, k, leg, scene, surface))
         stands = lens_frame(scene)
         if stands != Pose():
             if in_front:  # which the source illuminates: everything is in their frame, and otherwise in that of the lens
@@ -215,7 +214,7 @@ class System:
                 leg = AxisSegment(around.position, around.frame)
         elements = (*in_front, *elements)
         for k, component in enumerate(scene.behind, len(scene.in_front)):
-            elements += tuple(_elements_of(component, k, leg, scene, surface.spaces))
+            elements += tuple(_elements_of(component, k, leg, scene, surface))
             leg = component.axis_behind(leg)
         return cls((scene.source,), elements, (scene.screen,), scene.light, lit=lit, leg=leg if leg != AxisSegment() else None)
 

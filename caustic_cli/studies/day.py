@@ -1,9 +1,9 @@
 """The picture of a lens in a window through a day: where the sun carries it, and how long it is legible.
 
-Lens and screen stand still, and the sun moves: all sources at infinity have its direction, and those nearby stand still, too.  At
-each time the light is traced to the plane of the screen, and the image looked at twice: on the screen where it stands, and on a
-screen of the same size and shape that is moved in that plane after the picture, to the median of its light and then to the best
-match with the target (`studies.tolerances.best_shift`).  That of a curved screen is its tangent plane.
+Lens and screen stand still, and the sun moves: all sources at infinity have its direction, and those nearby and lasers stand still,
+too.  At each time the light is traced to the plane of the screen, and the image looked at twice: on the screen where it stands, and
+on a screen of the same size and shape that is moved in that plane after the picture, to the median of its light and then to the
+best match with the target (`studies.tolerances.best_shift`).  That of a curved screen is its tangent plane.
 
 Notation
     F           relative RMS error against the target, of two independent halves of the rays, corrected for their noise
@@ -249,8 +249,8 @@ class Follower:
 
 
 def _under(tilt: tuple[float, float], source: Source) -> Source:
-    """A source with the light of the sun in another direction, if it is at infinity."""
-    if not source.distant:
+    """A source with the light of the sun in another direction, if it is at infinity and no laser."""
+    if not source.distant or source.beam is not None:
         return source
     return replace(cast(Any, source), tilt=tilt, power=source.power * tilted(tilt)[2][2] / source.axis[2])
 

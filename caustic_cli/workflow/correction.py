@@ -31,6 +31,7 @@ from caustic_cli.project.packing import rounded
 from caustic_cli.project.project import Project
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.photograph import comparison
+from caustic_cli.studies.photograph.inference import FOUND
 from caustic_cli.studies.photograph.model import Guess, deviation, scaled
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.workflow import photographs
@@ -41,10 +42,9 @@ from caustic_cli.workflow.reporter import Reporter
 
 #: Draws from the posterior; rays per pixel of each of the two images by which one is judged, and least and most of them.
 DRAWS, EACH, LEAST, MOST = 8, 64, 200_000, 8_000_000
-#: Least part of a photograph's variance that a fit must explain, and least gain over its standard deviation.
-EXPLAINED, CERTAIN = 0.99, 2.0
-#: The former without marks, where the wrong part explains much, too.
-EXPLAINED_ALONE = 0.9995
+#: Least part of a photograph's variance that a fit must explain, and least gain over its standard deviation; the former without
+#: marks, where the wrong part explains much, too.
+EXPLAINED, CERTAIN, EXPLAINED_ALONE = 0.99, 2.0, FOUND
 PLOT = "correction.png"
 
 

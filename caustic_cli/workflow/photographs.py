@@ -109,6 +109,7 @@ class Judged:
             "relief_scale_sigma": left,
             "prior": {"amplitude_mm": f.prior.amplitude, "power": f.prior.power, "corner": f.prior.corner},
             "explained": f.explained,
+            "found": f.ended,
             "residual_codes": f.fits[0].residual,
             "correlated_px": f.fits[0].correlated,
             "not_told_apart": not_told_apart(f, self.marked, self.scenes[0].two_sided or bool(self.scenes[0].unfolded.elements)),

@@ -10,6 +10,7 @@ from caustic_cli.io.picture import WIDE, write_image, write_npy
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.photograph import comparison
+from caustic_cli.studies.photograph.inference import FOUND
 from caustic_cli.studies.viewing import as_viewed
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
@@ -105,6 +106,15 @@ def rows_of_part(f: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("scale of the relief", f"{part['relief_scale']:.4f} ± {part['relief_scale_sigma']:.4f}{same}"),
     ]
+    if not part["found"]:
+        found.insert(
+            0,
+            (
+                "uncertain",
+                f"only {part['explained']:.2%} is explained, of which the part's own deviation explains {FOUND:.2%}: where light is"
+                " folded finely, the fit ends on another surface, which is off by more than said",
+            ),
+        )
     found += [("not told apart", words) for words in part["not_told_apart"]]
     names = ("image", "missing_image", "plot", "part_file", "deviation_file")
     return [*found, ("files", ", ".join(f[name] for name in names))] if "plot" in f else found
