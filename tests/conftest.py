@@ -120,6 +120,8 @@ LONG = (
     "test_the_simulated_cut_is_that_of_the_arcs[simple-inch]",
     "test_corners_and_the_picture_itself_find_the_screen_too",
     "test_a_fit_that_ends_on_another_surface_is_said",
+    "test_advised_size_of_a_picture_has_the_relief_that_it_allows",
+    "test_steep_wall_is_as_thick_as_by_default_and_opened_again",
     "test_a_folded_caustic_is_inferred_within_what_is_said",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.001-0.05-1]",
     "test_one_photograph_is_enough_for_a_smooth_form_error[0.003-0.25-3]",

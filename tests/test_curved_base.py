@@ -236,38 +236,32 @@ def test_relief_is_moved_between_its_limits_as_little_as_possible():
     assert relief.placed(heights, low, high + 1.0)[0] == pytest.approx(heights)
 
 
-@pytest.mark.parametrize(("radius", "source"), [(TUBE, None), (DOME, Points(((0.0, 0.0, -22.0),))), (BOWL, None)])
-def test_magnification_is_that_of_traced_rays(radius, source):
-    scene = scene_of(radius, source, control=(60, 60))
-    field, heights = on_base(scene)
-    at = torch.tensor([[0.0, 1e-3, 0.0], [0.0, 0.0, 1e-3]]).double()
-    o = (at[0], at[1], torch.full((3,), -1e-3).double())
-    z = torch.full((3,), 1.0 if source is None else 22.0).double()
-    d = (0.0 * at[0], 0.0 * at[1], z) if source is None else (at[0], at[1], z)
-    length = (d[0] ** 2 + d[1] ** 2 + d[2] ** 2).sqrt()
-    tracer = Tracer(System.of(scene, field), RayState(o, tuple(c / length for c in d), torch.ones(3).double()))
-    (behind,), (landed,) = tracer({EXIT: heights}), tracer.land({EXIT: heights}, scene.screen)
-    for axis, expected in enumerate(relief.magnification(scene)):
-        ends = [float(s.origin[axis][axis + 1] - s.origin[axis][0]) for s in (landed, behind)]
-        assert ends[0] / ends[1] == pytest.approx(expected, abs=3e-3)
+@pytest.mark.parametrize(
+    ("radius", "source", "part", "closest"),
+    [
+        (TUBE, None, 0.3, (0.3, 0.7)),  # a smaller picture
+        (DOME, Points(((0.0, 0.0, -22.0),)), 0.5, (1.2, 4.0)),  # a larger one than the lamp throws without relief
+        (BOWL, None, 0.01, None),  # none, the shallowest of which is sought
+    ],
+)
+def test_advised_size_of_a_picture_has_the_relief_that_it_allows(radius, source, part, closest):
+    """As solved for at that size, far from its own; and the sizes between have deeper ones."""
+    scene = scene_of(radius, source, control=(30, 30), pixels=(30, 30), throw=200.0, width=40.0)
+    goal, field = np.ones((30, 30)), HeightField.of(scene.lens)
+    base = scene.lens.offset.heights(*(c.numpy() for c in field.control_xy()))
 
+    def depth(size: float) -> float:
+        larger = replace(scene, screen=replace(scene.screen, size=(40.0 * size, 40.0 * size)))
+        return np.ptp(first_surface(larger, goal, field, 64, fixed=True).heights.numpy() - base)
 
-def test_depth_at_another_size_is_that_of_its_own_surface():
-    """The relief of a picture predicted from that of a smaller one."""
-    scene = scene_of(TUBE, control=(40, 40), pixels=(40, 40), throw=300.0, width=40.0)
-    field, depths = HeightField.of(scene.lens), []
-    x, y = (c.numpy() for c in field.control_xy())
-    uniform = np.ones((40, 40))
-    for size in (1.0, 1.25):
-        screen = replace(scene.screen, size=(22.0 * size, 16.0 * size))
-        depths.append(
-            first_surface(replace(scene, screen=screen), uniform, field, 64).heights.numpy() - scene.lens.offset.heights(x, y)
-        )
-    across, along = relief.magnification(scene)
-    bowl = (across * x[:, None] ** 2 + along * y[None, :] ** 2) / (2.0 * (INDEX - 1.0) * (300.0 - WALL))
-    predicted = 1.25 * depths[0] + 0.25 * bowl
-    assert np.ptp(predicted) == pytest.approx(np.ptp(depths[1]), rel=0.05)
-    assert np.ptp(depths[0]) < 0.8 * np.ptp(depths[1])
+    heights = first_surface(scene, goal, field, 64, fixed=True).heights.numpy()
+    room = part * depth(1.0)
+    size, said = relief.fitting(replace(scene, lens=replace(scene.lens, height_range=(-room, 0.0))), field, heights, goal)
+    assert said == pytest.approx(depth(size), rel=0.03)
+    if closest is None:
+        assert said > room and min(depth(0.9 * size), depth(1.1 * size)) > said
+    else:
+        assert closest[0] < size < closest[1] and 0.95 * room < said <= room and depth(size**0.8) > room
 
 
 # A face of a STEP file

@@ -17,6 +17,7 @@ from caustic_cli.inverse.designer import Designer, InitialHeights
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.reachability import largest_magnification
 from caustic_cli.inverse.surface_from_map import OutOfReach
+from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture
 from caustic_cli.kinds import OneSurface, problem_of
@@ -154,7 +155,8 @@ def _prepared(project: Project, problem: OneSurface, first: InitialSurface | Non
         moved, lacking = relief.placed(heights.numpy(), *(limit.numpy() for limit in problem.bounds(0)))
         heights = torch.from_numpy(moved)
         if lacking:
-            words = relief.words(problem.scene, problem.field(0), moved, lacking, project.settings.target.size)
+            goal = grey(problem.target.numpy())
+            words = relief.words(problem.scene, problem.field(0), moved, lacking, project.settings.target.size, goal)
     return PreparedDesign(project, problem, Designer(problem).initial_heights(heights), misplaced, words)
 
 
