@@ -13,34 +13,25 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
-from importlib import import_module
 from itertools import cycle
 from typing import IO
 
 import numpy as np
 
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.kernels import cache
 
+multigrid, fields = OnDemand("caustic_cli.optics.kernels.multigrid"), OnDemand("caustic_cli.optics.kernels.fields")
+fused = OnDemand("caustic_cli.optics.kernels.fused_functions")
 #: Most processes, each of which loads the libraries.
 MOST = 3
 
 
 def _multigrid() -> None:
     """What is compiled of the linear equations of the Newton steps of a transport."""
-    from caustic_cli.optics.kernels import multigrid  # noqa: PLC0415
-
     start, column, one = np.arange(2, dtype=np.int32), np.zeros(1, np.int32), np.ones(1)
     multigrid.aggregate(start, column, one)
     multigrid.sweep(start, column, one, one, one, one.copy())
-
-
-def _calls(module: str, function: str) -> Callable[[], None]:
-    """A function that calls one of a module of this package, which is loaded then."""
-
-    def call() -> None:
-        getattr(import_module(f"caustic_cli.optics.kernels.{module}"), function)()
-
-    return call
 
 
 #: Parts of the kernels, in the order in which other processes compile them for a design while this one compiles what precedes them
@@ -49,10 +40,10 @@ def _calls(module: str, function: str) -> Callable[[], None]:
 #: wave and its adjoint; the wave image and its adjoint; the image by these rays; and its adjoint.
 PARTS: dict[str, tuple[str, Callable[[], None]]] = {
     "multigrid": ("multigrid.sweep", _multigrid),
-    "surface": ("spline.pull_coefficients", _calls("fused_functions", "compile_surface")),
-    "fields": ("fields.pull_displacement", _calls("fields", "compile_kernels")),
-    "image": ("random_points.scatter", _calls("fused_functions", "compile_image")),
-    "adjoint": ("fused.backward", _calls("fused_functions", "compile_adjoint")),
+    "surface": ("spline.pull_coefficients", lambda: fused.compile_surface()),  # noqa: PLW0108
+    "fields": ("fields.pull_displacement", lambda: fields.compile_kernels()),  # noqa: PLW0108
+    "image": ("random_points.scatter", lambda: fused.compile_image()),  # noqa: PLW0108
+    "adjoint": ("fused.backward", lambda: fused.compile_adjoint()),  # noqa: PLW0108
 }
 
 _processes: list[subprocess.Popen[str]] = []

@@ -237,17 +237,8 @@ class FusedPathChange(PathChange):
 
     def of(self, heights: Tensor) -> Tensor:
         """As the reference."""
-        out = torch.empty(self.weight.shape, dtype=torch.float32)
-        displace(
-            ALL,
-            *self.points,
-            self._flat(self.spline.coefficients(heights)),
-            *self.orders,
-            self.spline.pieces,
-            self.weight,
-            out.numpy(),
-            blocks(),
-        )
+        out, c = torch.empty(self.weight.shape, dtype=torch.float32), self._flat(self.spline.coefficients(heights))
+        displace(ALL, *self.points, c, *self.orders, self.spline.pieces, self.weight, out.numpy(), blocks())
         return out
 
     def pull(self, by: Tensor) -> Tensor:

@@ -15,15 +15,7 @@ from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks, fused, pixels, random_points
-from caustic_cli.optics.kernels.arguments import (
-    Exit,
-    ParallelLight,
-    Point,
-    RowsOfRays,
-    RowsOfSurface,
-    ScreenFrame,
-    Splat,
-)
+from caustic_cli.optics.kernels.arguments import Exit, ParallelLight, Point, RowsOfRays, RowsOfSurface, ScreenFrame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.fresnel import FRESNEL
 from caustic_cli.optics.kernels.grid import rows_at

@@ -26,16 +26,8 @@ FAST: dict[str, Any] = {"fastmath": {"contract", "nsz"}}
 #: Sums over many numbers, whose order is left to the compiler.
 SUMS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}}
 #: Loops over `prange` run in parallel, and nothing else: every array that is filled would be a parallel loop of its own.
-PARALLEL = {
-    "prange": True,
-    "comprehension": False,
-    "reduction": False,
-    "inplace_binop": False,
-    "setitem": False,
-    "numpy": False,
-    "stencil": False,
-    "fusion": False,
-}
+OTHER_LOOPS = ("comprehension", "reduction", "inplace_binop", "setitem", "numpy", "stencil", "fusion")
+PARALLEL = {"prange": True} | dict.fromkeys(OTHER_LOOPS, False)
 
 if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # kernels call one another by address, which only compiled code has
     raise InputError("the environment's NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it")
