@@ -78,7 +78,7 @@ LEVERAGE = 0.02
 #: factor of the standard deviation of s and what is added to it, so that they cover 100 parts (tests/benchmarks).
 EXCHANGED, CONTRAST = 2.0, 4e-3
 #: Part of a photograph's variance that the part's own deviation explains: of 30 random parts with marks (0.5 to 6 µm over 0.08 to
-#: 0.4 of a lens of 10 mm) the 24 whose surface was within what is said explained 99.975 % and more, the 6 others, off by 2.5 to 6
+#: 0.4 of a lens of 10 mm) the 23 whose surface was within what is said explained 99.955 % and more, the 7 others, off by 2.5 to 6
 #: times what is said, 99.8 % at most.
 FOUND = 0.9995
 #: Halvings of a step that does not help, and relative change of the objective at which a level ends.
