@@ -262,6 +262,7 @@ def test_command_writes_rings(tmp_path, monkeypatch, capsys):
         "1 --format stl": "at least 3 panels",
         "100000000 --format stl": "at most 360",
         "none.caustic --format stl": "none.caustic",
+        "² --format stl": "²: is not a caustic project",
         "a.caustic,a.caustic,a.caustic,a.caustic,c.caustic --format stl": "same material",
     }
     for options, words in refused.items():

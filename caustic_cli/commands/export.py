@@ -263,7 +263,7 @@ def _given(asked: ExportOptions, formats: list[str]) -> dict[str, Any]:
 
 def _ring(text: str) -> int | list[Path]:
     """Number of equal panels, or the projects of the others."""
-    if text.strip().isdigit():
+    if text.strip().isdecimal() and len(text) < 10:
         return int(text)
     paths = [Path(name.strip()) for name in text.split(",")]
     for path in paths:
