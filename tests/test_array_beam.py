@@ -14,7 +14,7 @@ from caustic_cli.inverse.lenslets import initial_array, lenslets
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Lens, Scene, Screen
+from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 from caustic_cli.scene.lens import array_control
 from caustic_cli.scene.sources.gaussian import Gaussian
 from caustic_cli.scene.sources.measured_beam import MeasuredBeam
@@ -99,6 +99,38 @@ def test_each_lenslet_maps_its_part_of_the_beam_onto_the_whole_picture():
         wanted = half * (2.0 * part - 1.0)
         off = np.abs(seen - wanted)
         assert np.sqrt(np.mean(off**2)) < 0.02 * half
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 10.0), (-12.0, 7.0)], ids=str)
+def test_each_lenslet_maps_its_part_of_tilted_light_onto_the_whole_picture(tilt):
+    """Landing points on an even rectangle, in closed form: the place in the lit part of the lenslet, which is all of it but in the
+    shadow of the array's sides.  Light through the entrance of a neighbour, a sixth of it here, goes there too."""
+    array, half, far = (2, 1), 8.0, 120.0
+    source = PlaneWave(tilt=tilt)
+    scene = array_of(source, array, 60, (8.0, 4.0), (2.0 * half, 2.0 * half))
+    d = np.array(source.axis)
+    middle = tuple(far * d[:2] / d[2])
+    scene = replace(scene, screen=Screen((2.0 * half, 2.0 * half), far, (16, 16), shift=middle))
+    made, field, index = initial_array(scene, [np.ones((16, 16))], scene.lens.control, 64), HeightField.of(scene.lens), 1.5
+    inside = np.array([*(d[:2] / index), math.sqrt(1.0 - float(d[:2] @ d[:2]) / index**2)])
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(-3.9, 3.9, 2000), rng.uniform(-1.9, 1.9, 2000)
+    z, gx, gy = (c.numpy() for c in field.at(made.heights, torch.from_numpy(x), torch.from_numpy(y)))
+    normal = np.stack([-gx, -gy, np.ones_like(z)]) / np.sqrt(1.0 + gx * gx + gy * gy)
+    cosine = inside @ normal  # Snell's law in vector form
+    bent = np.sqrt(1.0 - index * index * (1.0 - cosine * cosine)) - index * cosine
+    out = index * inside[:, None] + bent * normal
+    drift = (z.mean() - scene.lens.z_in) * inside[:2] / inside[2]
+    assert np.abs(drift).max() > 0.3
+    shown = np.ones(len(x), dtype=bool)
+    cells = (np.where(x < 0, -4.0, 0.0), np.where(x < 0, 0.0, 4.0), 4.0), (-2.0, 2.0, 2.0)
+    for at, (first, last, edge), k, moved, centre in zip((x, y), cells, out[:2] / out[2], drift, middle, strict=True):
+        low, high = np.maximum(first, moved - edge), np.minimum(last, moved + edge)
+        shown &= (at > low + 0.05) & (at < high - 0.05)
+        wanted = half * (2.0 * (at - low) / (high - low) - 1.0)
+        off = (at + k * (far - z) - centre - wanted)[shown]
+        assert np.sqrt(np.mean(off**2)) < 0.03 * half
+    assert shown.mean() > 0.7
 
 
 @pytest.mark.parametrize(("m2", "told"), [(1.0, True), (20.0, False)])

@@ -57,6 +57,8 @@ ROUNDED = 1e-9
 CORNERS = 1 << 17
 #: A point and two beside it, along x and y, in the steps of finite differences.
 BESIDE = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+#: The scene of an array, and the centre of a lens in it, mm.
+Place = tuple[Scene, tuple[float, float]]
 
 
 def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
@@ -254,10 +256,10 @@ def _of_beam(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
 
 
 def lit_rectangle(
-    scene: Scene, surface: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    scene: Scene, surface: Callable[[np.ndarray, np.ndarray], np.ndarray], array: Place | None = None
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Lower and upper limits, x and y, mm, of the rectangle of the exit that light reaches: all of it, less what is in the shadow
-    of the lens' sides where light is tilted to the axis.
+    of the lens' sides, or of those of the array to which it belongs, where light is tilted to the axis.
 
     surface: heights (n, m) of the exit, mm, at x (n,), y (m,).
 
@@ -265,18 +267,19 @@ def lit_rectangle(
         InputError: no light reaches the exit.
     """
     lens, source = scene.lens, scene.source
+    whole, middle = (scene, (0.0, 0.0)) if array is None else array
     low, high = [-r for r in lens.half_size], list(lens.half_size)
     if not source.oblique:
         return (low[0], low[1]), (high[0], high[1])
     lines = [np.linspace(-r, r, EDGE) for r in lens.half_size]
     for axis, slope in enumerate(slopes_inside(source.axis, lens.inside)):
-        limit = low if slope > 0 else high
+        limit, half = low if slope > 0 else high, lens.half_size[axis]
+        edge = math.copysign(whole.lens.half_size[axis], -slope) - middle[axis]
         for _ in range(PASSES if slope else 0):  # the light that passes this edge of the entrance meets the exit at its own height
             places = list(lines)
             places[axis] = np.array([limit[axis]])
             depth = float(surface(*places).min()) - lens.pupil.z
-            half = lens.half_size[axis]
-            limit[axis] = min(half, max(-half, math.copysign(half, -slope) + slope * depth))
+            limit[axis] = min(half, max(-half, edge + slope * depth))
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise InputError("⟨source.tilt⟩: all light leaves the lens through its sides; a thinner lens or less tilt keeps some")
     return (low[0], low[1]), (high[0], high[1])

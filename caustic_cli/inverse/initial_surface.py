@@ -21,7 +21,7 @@ from torch import Tensor
 
 from caustic_cli.effort import STANDARD
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.incidence import incident, is_traced, lit_rectangle, part_within
+from caustic_cli.inverse.incidence import Place, incident, is_traced, lit_rectangle, part_within
 from caustic_cli.inverse.projection import CrossedProjection, ScreenProjection, projection_of, seen_by_light
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scattered import Pixels
@@ -66,8 +66,6 @@ UNREACHED = (
 )
 
 
-#: The scene of an array, and the centre of a lens in it, mm.
-Place = tuple[Scene, tuple[float, float]]
 #: Heights (n, m), mm, at x (n,), y (m,), mm.
 Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -98,7 +96,7 @@ class _Grid:
     @classmethod
     def of(cls, scene: Scene, target: np.ndarray, cells: int, surface: Surface | None = None, array: Place | None = None) -> _Grid:
         """Cells where light reaches a surface, the offset unless it is given."""
-        low, high = lit_rectangle(scene, surface or scene.lens.offset.heights)
+        low, high = lit_rectangle(scene, surface or scene.lens.offset.heights, array)
         half, middle = ([0.5 * (b + s * a) for a, b in zip(low, high, strict=True)] for s in (-1.0, 1.0))
         return cls(scene, target, *cell_lines((half[0], half[1]), cells), (middle[0], middle[1]), array)
 
@@ -269,11 +267,11 @@ class _TruncatedSurface:
         return self.mapped.heights
 
 
-def _rough_surface(scene: Scene, target: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+def _rough_surface(scene: Scene, target: np.ndarray, array: Place | None) -> Surface:
     """Heights of a first surface on ROUGH cells in tilted light, as a function of places x (n,), y (m,), mm: (n, m)."""
     lens = scene.lens
     begun = _in_aperture(lens) if lens.mirror else lens.offset.heights
-    rough = _Grid.of(scene, target, ROUGH, begun)
+    rough = _Grid.of(scene, target, ROUGH, begun, array)
     solved = rough.solved(*rough.incident(begun(*rough.places)), float(rough.offset.mean())).heights
     if lens.mirror:  # with its edge in the aperture of the light, none of which then passes it
         solved = solved + lens.pupil.z - _edge(solved, slopes_inside(scene.source.axis, 1.0))
@@ -318,8 +316,8 @@ def first_surface(
     grid, lens = _Grid.of(scene, target, cells, array=array), scene.lens
     z = grid.offset
     if scene.source.oblique:  # the shadow of the lens' sides depends on the heights
-        surface = _rough_surface(scene, target)
-        grid = _Grid.of(scene, target, cells, surface)
+        surface = _rough_surface(scene, target, array)
+        grid = _Grid.of(scene, target, cells, surface, array)
         z = surface(*grid.places)
     if scene.source.distant or lens.mirror or scene.elements or lens.entrance is not None:
         known = similar if similar is not None and similar.shape == z.shape else None

@@ -303,9 +303,10 @@ def initial_array(
     parts, lens = lenslets(scene, control), scene.lens
     whole = replace(scene, lens=replace(lens, array=(1, 1)))
     each = targets if len(targets) == len(parts) else [targets[0]] * len(parts)
+    own = scene.source.by_lenslet or (scene.source.distant and not scene.source.oblique)  # no light through its neighbours
     nets, known = [], dict[tuple, np.ndarray | None]()  # of a picture and an outline, in the light of another lenslet
     for k, (one, goal) in enumerate(zip(parts, each, strict=True)):
-        place = None if scene.source.distant or scene.source.by_lenslet else (whole, one.middle)
+        place = None if own else (whole, one.middle)
         outline = ((x - one.middle[0], y - one.middle[1]) for x, y in lens.cells.outline(k))
         alike = id(goal), *((round(x / lens.cells.radius, 1), round(y / lens.cells.radius, 1)) for x, y in outline)
         light = {"array": place, "similar": known.get(alike)}
