@@ -23,8 +23,10 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, tracers
 from caustic_cli.project.completion import complete
-from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen, equal_cells
 from caustic_cli.scene.packing import ConvexAperture, cells_of
 from caustic_cli.studies.retrace import retrace
 
@@ -100,6 +102,24 @@ def test_they_are_the_assignment_of_least_cost(array, size):
     assert (near[points] == places // each).mean() < 0.9
 
 
+@pytest.mark.parametrize("array", [(6, 5), (12, 12)])
+def test_a_step_of_newtons_method_by_its_edges(array):
+    """Against the dense equations by singular values, whose solution of the least norm has the mean 0."""
+    cells = cells_of("hexagonal", array, (10.0, 10.0), equal=True)
+    diagram, count = equal_cells._diagram(cells, np.zeros(math.prod(array))), math.prod(array)
+    slope = np.zeros((count, count))
+    for (k, q), length in diagram.borders.items():
+        assert diagram.borders[q, k] == pytest.approx(length, rel=1e-9)
+        by = 0.5 * length / math.dist(cells.centres[k], cells.centres[q])
+        slope[k, k] += by
+        slope[k, q] -= by
+    change = diagram.areas.mean() - diagram.areas
+    wanted = np.linalg.lstsq(slope, change, rcond=1e-10)[0]
+    np.testing.assert_allclose(
+        equal_cells._laplace(diagram.borders, cells.centres, change), wanted, atol=1e-9 * np.abs(wanted).max()
+    )
+
+
 @pytest.mark.parametrize("lenslets_", ["filled", "round"])
 def test_light_of_hexagonal_lenslets_is_equal(lenslets_):
     parts = lenslets(hexagonal((3, 3), (9.0, 9.0), lenslets=lenslets_))
@@ -137,6 +157,42 @@ def test_light_between_round_lenslets_is_absorbed(packing, fill):
         sent = 1.0 - image.lost["missed_lens"]
         assert image.image.sum() / sent == pytest.approx(fill, abs=0.003)
         assert image.lost["missed_surface"] / sent == pytest.approx(1.0 - fill, abs=0.003)
+
+
+TILTED = PlaneWave(tilt=(6.0, -10.0))
+
+
+@pytest.mark.parametrize("packing", ["square", "hexagonal"])
+@pytest.mark.parametrize("source", [PlaneWave(), TILTED, Points(((1.0, -2.0, -40.0),))], ids=["plane", "tilted", "point"])
+def test_round_lenslets_by_one_kernel(packing, source):
+    """Image and losses against the stages of a trace, by the same rays of a plane wave and else by rays through the entrance,
+    intersected one by one; the gradient against differences."""
+    scene = hexagonal((4, 3), (8.0, 6.0), packing=packing, lenslets="round", control=(45, 37) if packing == "square" else (60, 45))
+    x, y, along = source.axis if source is TILTED else (0.0, 0.0, 1.0)
+    scene = replace(
+        scene, source=source, screen=Screen((60.0, 60.0), 200.0, (30, 25), shift=(200.0 * x / along, 200.0 * y / along))
+    )
+    field, filter, same = HeightField.of(scene.lens), Filter("cosine", (3, 3)), source == PlaneWave()
+    z, way = bumps(scene, size=0.01), bumps(scene, seed=2, size=1.0) - 5.0
+    (traced,) = tracers(scene, field, rays_of(scene, "grid", 200_000), torch.float64, 1 << 20)
+    assert traced.fused is not None
+    part, system = traced.expose({EXIT: z}, scene.screen, filter), System.of(scene, field)
+    assert float(part.image.sum()) + sum(map(float, part.lost.values())) == pytest.approx(1.0, abs=1e-12)
+    (rays,) = rays_of(scene, "grid" if same else "sobol", 200_000).chunks()
+    stages = Tracer(system, rays)
+    seen = stages.collect(stages({EXIT: z}), scene.screen, filter)
+    for name, value in seen.lost.items():
+        assert float(part.lost.get(name, 0.0)) == pytest.approx(float(value), abs=1e-12 if same else 2e-3)
+    assert float(part.lost["missed_surface"]) > 0.1
+    assert float((part.image - seen.image).norm()) < (1e-10 if same else 1e-2) * float(seen.image.norm())
+    pull = torch.linspace(-1.0, 1.0, 750, dtype=torch.float64).view(30, 25) ** 2
+
+    def value(z):
+        return (traced.expose({EXIT: z}, scene.screen, filter).image * pull).sum()
+
+    (gradient,) = torch.autograd.grad(value(z.requires_grad_()), z)
+    difference = (value(z.detach() + 1e-6 * way) - value(z.detach() - 1e-6 * way)) / 2e-6
+    assert float((gradient * way).sum()) == pytest.approx(float(difference), rel=1e-4)
 
 
 # Sections

@@ -57,6 +57,8 @@ class Beam(Bundle):
     emitted: float
     #: See `at_pupil`.
     rays_at_pupil: Callable[[], RayState]
+    #: As of a `Bundle`.
+    clear: Tensor | None = None
 
     def at_pupil(self) -> RayState:
         """As of a `Bundle`."""
@@ -86,6 +88,6 @@ class Beam(Bundle):
         over = 1.0 / math.sqrt(1.0 + kx * kx + ky * ky)
         lit = self.aperture.contains(x - kx * z.detach(), y - ky * z.detach())
         along = (1.0 - kx * slopes[0] - ky * slopes[1]).clamp_min(0.0)
-        power = self.sample.flux * self.irradiance * self.transmittance(n, fresnel) * torch.where(lit, along, 0.0)
+        power = self.areas * self.irradiance * self.transmittance(n, fresnel) * torch.where(lit, along, 0.0)
         direction = tuple(torch.full_like(power, c * over) for c in (kx, ky, 1.0))
         return direction, power

@@ -1,7 +1,8 @@
 """The lowering of a trace to one fused kernel: the only place that knows which systems it covers.
 
 It takes the rays in front of the last surface, a single upright B-spline at the origin in front of an upright screen, where nothing
-but refraction with Fresnel losses happens to them, or reflection of parallel light; see `backends`.
+but refraction with Fresnel losses happens to them, or reflection of parallel light; see `backends`.  Rays through given points of
+that surface have no power where its aperture is not clear, between round lenslets or beside the cell of a hexagonal one.
 """
 
 from __future__ import annotations
@@ -9,10 +10,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypeGuard
 
+from torch import Tensor
+
 from caustic_cli.optics.backends import Fused
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.pencil import Bundle
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces import HeightField, Plane
 from caustic_cli.optics.system import Element, PlacedScreen
 from caustic_cli.scene import Pupil, Screen
@@ -33,11 +37,13 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
     eta = inside.index_at(start.wavelength) / outside.index_at(start.wavelength)
     if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface
         return None
-    if not start.along_axis:
-        return tracer.backend.ray_image(element.surface, start, eta, element.fresnel, element.aperture.radius, previous)
-    if element.aperture != system.pupil.aperture:
-        return None
-    return tracer.backend.plane_image(element.surface, start, eta, element.fresnel, previous)
+    if start.sample is None or not start.along_axis:
+        aperture = element.aperture
+        if not aperture.compiled:
+            return None
+        return tracer.backend.ray_image(element.surface, start, eta, element.fresnel, aperture.radius, previous)
+    clear = _clear(element, system.pupil, start.sample)
+    return tracer.backend.plane_image(element.surface, start, eta, element.fresnel, clear, previous)
 
 
 def _pencil(tracer, pencil: Bundle, previous: Fused | None) -> Fused | None:
@@ -48,21 +54,31 @@ def _pencil(tracer, pencil: Bundle, previous: Fused | None) -> Fused | None:
         return None
     if len(system.elements) == 1 and pencil.reflects:
         (exit,), pupil = system.elements, system.pupil
-        if not (exit.reflects and _is_upright(exit, pupil) and exit.aperture == pupil.aperture):
+        if not (exit.reflects and _is_upright(exit, pupil)):
             return None
+        pencil = pencil.through(_clear(exit, pupil, pencil.sample))
         return pencil.maker(tracer.backend)(exit.surface, pencil, (1.0, "none"), -1.0, "none", previous)
     if len(system.elements) != 2:
         return None
     (entrance, exit), pupil = system.elements, system.pupil
     upright = isinstance(entrance.surface, Plane) and entrance.pose == Pose((0.0, 0.0, pupil.z)) and not entrance.reflects
-    if not (upright and _is_plain(exit, pupil) and exit.aperture == entrance.aperture == pupil.aperture):
+    if not (upright and _is_plain(exit, pupil) and entrance.aperture == pupil.aperture):
         return None
     before, inside, outside = (medium.index_at(tracer.wavelength) for medium in tracer.media)
     if inside <= before or (exit.fresnel == "schlick" and inside < outside):
         return None
+    pencil = pencil.through(_clear(exit, pupil, pencil.sample))
     return pencil.maker(tracer.backend)(
         exit.surface, pencil, (inside / before, entrance.fresnel), inside / outside, exit.fresnel, previous
     )
+
+
+def _clear(exit: Element, pupil: Pupil, sample: Sample) -> Tensor | None:
+    """Whether the aperture of the last surface is clear at points of it, of the sample's shape; None if it is the pupil's."""
+    if exit.aperture == pupil.aperture:
+        return None
+    x, y = ((2.0 * c - 1.0) * r for c, r in zip((sample.u, sample.v), pupil.half_size, strict=True))
+    return exit.aperture.contains(*((x[:, None], y[None, :]) if sample.tensor else (x, y)))
 
 
 def _needs_stages(tracer) -> bool:
@@ -80,7 +96,6 @@ def _is_upright(element: Element, pupil: Pupil) -> bool:
     surface = element.surface
     return (
         isinstance(surface, HeightField)
-        and element.aperture.compiled
         and element.pose == Pose()
         and element.aperture.half_size == surface.half_size == pupil.half_size
     )

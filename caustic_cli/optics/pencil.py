@@ -32,8 +32,8 @@ aperture, whatever the heights.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import torch
@@ -57,6 +57,8 @@ class Bundle:
 
     #: The points, and the area of the aperture, mm^2, that each stands for.
     sample: Sample
+    #: Whether the last surface is clear there, of the sample's shape; None everywhere.
+    clear: Tensor | None
 
     @property
     def count(self) -> int:
@@ -67,6 +69,15 @@ class Bundle:
     def device(self) -> torch.device:
         """Where its points are."""
         return self.sample.device
+
+    @property
+    def areas(self) -> Tensor:
+        """The clear area of the last surface, mm^2, that each point stands for."""
+        return self.sample.flux if self.clear is None else self.sample.flux * self.clear
+
+    def through(self, clear: Tensor | None) -> Self:
+        """The same behind a last surface that is clear at these points alone, see `clear`."""
+        return replace(cast(Any, self), clear=clear)
 
     #: Whether the fused kernel for them also reflects.
     reflects: ClassVar[bool] = False
@@ -98,6 +109,8 @@ class Pencil(Bundle):
     emitted: float
     #: See `at_pupil`.
     rays_at_pupil: Callable[[], RayState]
+    #: As of a `Bundle`.
+    clear: Tensor | None = None
 
     def at_pupil(self) -> RayState:
         """As of a `Bundle`."""
@@ -183,7 +196,7 @@ class Pencil(Bundle):
         density = self.emission(t / (1.0 + t), n, fresnel) * u / (h + z * n * n * c**3)
         along = 1.0 - k * (x * slopes[0] + y * slopes[1])
         over = 1.0 / torch.sqrt(1.0 + k * k * q)
-        return (k * x * over, k * y * over, over), self.sample.flux * density * along.clamp_min(0.0)
+        return (k * x * over, k * y * over, over), self.areas * density * along.clamp_min(0.0)
 
 
 def entrance_transmittance(secant: Tensor, n: float, fresnel: str) -> Tensor:

@@ -182,9 +182,14 @@ class Numba(Torch):
         """As the reference."""
         return splat_rays(x, y, weight, screen, filter)
 
-    def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None) -> PlaneImage:
-        """The fused kernel for rays of a plane wave on a B-spline: a function of heights, screen and filter."""
-        return PlaneImage(field, rays, eta, fresnel, like)
+    def plane_image(
+        self, field, rays: RayState, eta: float, fresnel: str, clear: Tensor | None, like: PlaneImage | None
+    ) -> PlaneImage:
+        """The fused kernel for rays of a plane wave on a B-spline: a function of heights, screen and filter.
+
+        clear: whether its aperture is clear at each ray, of the sample's shape; None for all.
+        """
+        return PlaneImage(field, rays, eta, fresnel, clear, like)
 
     def pencil_image(
         self, field, pencil: Pencil, entrance: tuple[float, str], eta: float, fresnel: str, like: PencilImage | None
@@ -217,18 +222,22 @@ def _components(vector) -> tuple:
 class PlaneImage:
     """See `Numba.plane_image`; like: that of the previous chunk, whose basis values along v are reused if they are the same."""
 
-    def __init__(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None):
+    def __init__(self, field, rays: RayState, eta: float, fresnel: str, clear: Tensor | None, like: PlaneImage | None):
         s = rays.sample
         assert s is not None
         self.interface = eta, fresnel
+        power = rays.power if clear is None else rays.power * clear
+        #: What is lost beside the aperture.
+        self.lost = {} if clear is None else {"missed_surface": rays.total(rays.power - power)}
         self.kernel: fused_functions.PlaneKernel = fused_functions.PlaneKernel(
-            field.spaces, field.half_size, s.u, s.v, s.tensor, rays.power, like.kernel if isinstance(like, PlaneImage) else None
+            field.spaces, field.half_size, s.u, s.v, s.tensor, power, like.kernel if isinstance(like, PlaneImage) else None
         )
 
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
         """Image, power that leaves the surface, and what was lost there."""
         reference = float(heights.detach().mean())
-        return self.kernel(heights - reference, *self.interface, screen.z - reference, screen, filter)
+        image, leaving, lost = self.kernel(heights - reference, *self.interface, screen.z - reference, screen, filter)
+        return image, leaving, lost | self.lost
 
 
 class PencilImage:

@@ -122,7 +122,7 @@ class BeamKernel(PlaneKernel):
 
     def __init__(self, spaces, half_size, beam: Beam, entrance: tuple[float, str], like: BeamKernel | None = None):
         sample = beam.sample
-        super().__init__(spaces, half_size, sample.u, sample.v, sample.tensor, sample.flux, like)
+        super().__init__(spaces, half_size, sample.u, sample.v, sample.tensor, beam.areas, like)
         self.z_in, self.k, self.half_size = beam.z_in, beam.inside(entrance[0]), beam.aperture.half_size
         self.round, self.power = bool(beam.aperture.round), beam.irradiance * beam.transmittance(*entrance)
 
@@ -149,7 +149,7 @@ class PencilKernel(PlaneKernel):
         self, spaces, half_size, pencil: Pencil, index: float, emission: tuple[np.ndarray, float], like: PencilKernel | None = None
     ):
         sample, self.place = pencil.sample, pencil.position[:2]
-        super().__init__(spaces, half_size, sample.u, sample.v, True, sample.flux, like, self.place)
+        super().__init__(spaces, half_size, sample.u, sample.v, True, pencil.areas, like, self.place)
         self.pencil, self.index, (self.coefficients, most) = pencil, index, emission
         self.scale = 2.0 / most
 
