@@ -15,6 +15,7 @@ from scipy.interpolate import BSpline, NdBSpline
 from scipy.spatial import cKDTree
 
 from caustic_cli import cli, load
+from caustic_cli.config.settings import build_lens
 from caustic_cli.errors import InputError
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.milling.gcode import write_gcode
@@ -34,7 +35,9 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System, entrance_of
 from caustic_cli.optics.trace import Tracer, expose, is_lowered
 from caustic_cli.scene import FreeForm, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.schema.table import LensSettings
 from caustic_cli.studies.retrace import retrace
+from caustic_cli.workflow import preparation
 from caustic_cli.workflow.machining import cut_surface
 
 INF, WALL, INDEX = math.inf, 3.0, 1.49
@@ -100,6 +103,26 @@ def test_wall_has_to_be_thinner_than_the_radius():
         parallel_side(Offset(6.0, (6.5, 6.5)), -1.0 + 7.5, (5.0, 2.0))
     with pytest.raises(InputError, match="thickness of the wall"):
         parallel_side(Offset(0.0, DOME), 0.0, HALF)
+    # the circle of radius 30 - 16 does not reach 15 mm, that of 30 - 14.9 does
+    with pytest.raises(InputError, match="wall of 16 mm ends within the aperture; a narrower lens or a thinner wall"):
+        parallel_side(Offset(0.0, (-30.0, math.inf)), 16.0, (15.0, 15.0))
+    edge = parallel_side(Offset(0.0, (-30.0, math.inf)), 14.9, (15.0, 15.0)).at(np.array([-1.0, 0.0, 1.0]), np.zeros(1))
+    assert edge[1, 0] - edge[0, 0] == pytest.approx(15.1 - math.sqrt(15.1**2 - 15.0**2), rel=0.05)
+
+
+@pytest.mark.parametrize("limits", [None, (-0.6, 0.0)])
+def test_a_wall_that_a_deep_relief_makes_thicker(limits):
+    """By one and a half times what the surface lies too deep, but not by what limits cut off."""
+    own = {"lens": {"height_range": list(limits)}} if limits else {}
+    given = {"size": [20.0, 20.0], "thickness": 5.0, "radius": [-60.0, INF], "entrance": "parallel", "control": [9, 9]}
+    lens = LensSettings.of(given | {"height_range": list(limits or (-20.0, 20.0))})
+    made = build_lens(lens)
+    base = made.offset.heights(*(c.numpy() for c in HeightField.of(made).control_xy()))
+    first = torch.from_numpy(base - np.linspace(0.0, 7.0, 9)[:, None])
+    found = preparation._room(lens, own, first)
+    assert found.get("thickness", 5.0) == (
+        5.0 if limits else pytest.approx(5.0 + 1.5 * (7.0 - 5.0 + lens.min_thickness) + 0.4, abs=0.3)
+    )
 
 
 # Light

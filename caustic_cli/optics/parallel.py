@@ -33,18 +33,27 @@ def parallel_side(base: Offset, wall: float, half_size: tuple[float, float]) -> 
     """The inner side over an aperture of half widths `half_size`, mm, from its vertex.
 
     Raises:
-        InputError: the wall is not thinner than the least radius of curvature of the base surface.
+        InputError: the wall is not thinner than the least radius of curvature of the base surface, or its inner side ends within
+            the aperture.
     """
     if not wall > 0:
         raise InputError(f"⟨lens.entrance⟩ parallel needs ⟨+lens.thickness⟩ above z_in, the thickness of the wall, got {wall:g} mm")
     x, y = np.meshgrid(*(np.linspace(-r, r, POINTS) for r in half_size), indexing="ij")
     a, b = x, y
+    gx, gy = base.slopes(a, b)
     for _ in range(STEPS):
-        gx, gy = base.slopes(a, b)
         over = wall / np.sqrt(1.0 + gx * gx + gy * gy)
         before, (a, b) = (a, b), (x - over * gx, y - over * gy)
         if max(np.abs(a - before[0]).max(), np.abs(b - before[1]).max()) <= STILL * max(half_size):
             break
+        try:
+            gx, gy = base.slopes(a, b)
+        except InputError as error:
+            raise InputError(
+                f"⟨lens.entrance⟩ parallel: the inner side of a wall of {wall:.3g} mm ends within the aperture; a narrower lens or"
+                " a thinner wall has one (where the thickness is derived, the relief makes it so thick: limits of its depth,"
+                " ⟨+lens.height_range⟩, or a larger ⟨+mag⟩ lessen it)"
+            ) from error
     else:
         raise InputError(f"⟨lens.entrance⟩ parallel needs a wall thinner than the radii of the base surface, got {wall:g} mm")
     gx, gy = base.slopes(a, b)

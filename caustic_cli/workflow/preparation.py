@@ -211,14 +211,17 @@ def _spare(lens: LensSettings, said: Given, first: torch.Tensor) -> float:
 
 
 def _room(given: LensSettings, said: Given, first: torch.Tensor) -> dict[str, Any]:
-    """Height range and thickness as the initial surface requires, where it needs others and the user fixed none."""
-    lens = build_lens(given)
+    """Height range and thickness as the initial surface requires, where it needs others and the user fixed none; of limits that he
+    gave, what is left of it between them."""
+    lens, fixed = build_lens(given), said.get("lens", {})
     offset = HeightField.of(replace(lens, control=tuple(first.shape)))
     x, y = (c.numpy() for c in offset.control_xy())
-    base = lens.offset.heights(x, y)
-    departure = 2.0 * float(np.abs(first.numpy() - base).max())
-    short = float((lens.floors(x, y) - first.numpy()).max())
-    fixed, changed = said.get("lens", {}), dict[str, Any]()
+    base, heights = lens.offset.heights(x, y), first.numpy()
+    if "height_range" in fixed:
+        low, high = (base + limit for limit in lens.height_range)
+        heights = relief.placed(heights, low, high)[0].clip(low, high)
+    departure = 2.0 * float(np.abs(heights - base).max())
+    short, changed = float((lens.floors(x, y) - heights).max()), dict[str, Any]()
     if departure > lens.height_range[1] and "height_range" not in fixed:
         changed["height_range"] = (-departure, departure)
     if short > 0 and "thickness" not in fixed:
