@@ -142,7 +142,7 @@ class LensletArray(OneSurface):
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
         goals = [grey(target.numpy()) for target in self.targets] or [goal]
         most, least = max(scene.lens.array), self.effort.lenslet_cells
-        coarse = max(
-            least, COARSE // most
-        )  # maps of finer cells follow from it: solved on those of one lens they take longer, and err more
-        return InitialSurface(initial_array(scene, goals, self.stages[0].control, max(least, cells // most), coarse).heights)
+        each = max(least, cells // most)
+        # the cells of all are at most as many as of one lens, and maps are evaluated on finer ones: directly solved, they err more
+        coarse = max(least, min(2 * COARSE // most, (each - 1) // 2))
+        return InitialSurface(initial_array(scene, goals, self.stages[0].control, each, coarse).heights)
