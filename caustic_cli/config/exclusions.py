@@ -60,19 +60,15 @@ EXCLUDED: dict[str, dict[str, str]] = {
         "source.spectrum": "⟨source.spectrum⟩ is not for a coloured picture, whose three wavelengths are its colours",
     },
     **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
-    "element": {"lens.gradient free": "{said} cannot be combined with ⟨element⟩: it is designed for light that goes straight on"},
     "element.free": dict.fromkeys(
-        ("design.network", "design.optimizer", "target.color", "design.waves on"),
+        ("lens.gradient free", "design.network", "design.optimizer", "target.color", "design.waves on"),
         "{said} cannot be combined with ⟨element.free⟩: it is not implemented beside other free surfaces",
     ),
     "lens.gradient free": {
         "lens.mirror": "⟨lens.gradient⟩ free needs a lens: light never enters a mirror",
         "lens.array": "⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat",
-        "target.color": "⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength",
         "design.robust": "{said} averages over errors of a designed surface, but ⟨lens.gradient⟩ free designs the index",
-        **dict.fromkeys(
-            ("design.network", "design.optimizer", "design.loss"), "⟨{path}⟩ of a free gradient must be {default}, got {value}"
-        ),
+        **dict.fromkeys(("design.network", "design.optimizer"), "⟨{path}⟩ of a free gradient must be {default}, got {value}"),
         "design.waves on": "⟨design.waves⟩ on refines heights, but ⟨lens.gradient⟩ free designs the index, by rays",
     },
     "source.each": {
@@ -81,7 +77,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
     },
     "source.tilt": {
         **dict.fromkeys(
-            ("lens.gradient free", "element", "design.over"),
+            ("element", "design.over"),
             "⟨source.tilt⟩ cannot be combined with ⟨{path}⟩, whose light is along the axis",
         ),
     },

@@ -1,4 +1,4 @@
-"""Design of a gradient-index lens whose index and exit surface are found together.
+"""Optimisation of the index of a gradient-index lens, alone or together with its exit surface.
 
 Notation
     z, n        heights of the exit, mm, and index
@@ -13,7 +13,9 @@ search, scaled such that steps of equal length change the optical path, as a fun
     c = (n_0 - 1) Z / (t R) sqrt(k N_i / N_s)    Z, R ranges of heights and index; N_s, N_i control points of surface and layer
 
 with k layers, so that corrections are shared and neither block stalls.  The search minimises half the squared relative RMS, as
-that of a surface does.
+that of a surface does.  The values of the index are kept within the range of the material by tanh.  An index alone is searched in
+the coordinates of the inverse Laplacian of each layer (`parametrisation`), since the image depends on the Laplacian of the index as
+it does on that of a surface.
 """
 
 from __future__ import annotations
@@ -22,43 +24,46 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.inverse.constraints import Limits
-from caustic_cli.inverse.gradient_index import (
-    INSIDE,
-    IndexObjective,
-    OnIteration,
-    iterate,
-    refuse_index_design,
-    transport_index,
-    volume,
-)
 from caustic_cli.inverse.lbfgs import LBFGS
-from caustic_cli.inverse.losses import NoLight
+from caustic_cli.inverse.losses import ColorLoss, Loss, NoLight
 from caustic_cli.inverse.objective import Evaluation
 from caustic_cli.inverse.parametrisation import FreeHeights
-from caustic_cli.inverse.schedule import LossImage
-from caustic_cli.optics.gradient.fields import SplineIndex
 from caustic_cli.optics.pullback import pull_back
-from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.system import EXIT
-from caustic_cli.scene import Scene
+from caustic_cli.optics.system import ENTRANCE, EXIT
+from caustic_cli.optics.trace import Parameters
+from caustic_cli.scene import Lens
 
-#: Largest part of the deflection that the initial index takes.
-SHARE = 0.5
+#: Name of the index among the parameters of a trace (`gradient.medium.index_name`).
+INDEX = f"{ENTRANCE}.index"
 #: Parts of a `FirstValues` that the state of a search holds, since its unknowns count from there.
 BEGUN = ("heights", "index")
+#: Weights of the steps of exit and index: of both, and of the index alone.
+BOTH, INDEX_ALONE = (1.0, 1.0), (0.0, 1.0)
+#: Called with the iteration, the loss, the fraction of the light on the screen and the image there.
+OnIteration = Callable[[int, float, float, Tensor | None], None]
+
+
+class LossOfLens(Protocol):
+    """The loss as a function of the heights of the exit, EXIT: (n, m) mm, and of the control values of the index, INDEX: (i, j,
+    layers)."""
+
+    loss: Loss | ColorLoss
+
+    def evaluate(self, parameters: Parameters) -> Evaluation:
+        """Value and gradients."""
 
 
 @dataclass(frozen=True, eq=False)
 class IndexAndExit:
-    """A gradient-index lens: its index, heights of the exit (n, m) mm, and the state from which the search continues bitwise."""
+    """A gradient-index lens: control values (i, j, layers) of its index, heights (n, m) mm of its exit, and the state from which
+    the search continues bitwise."""
 
-    index: SplineIndex
+    index: Tensor
     heights: Tensor
     state: dict[str, Tensor]
 
@@ -67,7 +72,7 @@ class IndexAndExit:
 class FirstValues:
     """Where a search begins."""
 
-    #: Heights of the exit (n, m) mm, and control values of the index (n, m, layers).
+    #: Heights of the exit (n, m) mm, and control values of the index (i, j, layers).
     heights: Tensor
     index: Tensor
     #: Least and largest heights (n, m), mm, and the same of the control values.
@@ -75,42 +80,25 @@ class FirstValues:
     limits: tuple[float, float]
 
 
-def initial_index(
-    scene: Scene, target: np.ndarray, control: tuple[int, int], limits: tuple[float, float], cells: int, share: float = SHARE
-) -> Tensor:
-    """Control values (n, m) of the index that takes `share` of the deflection, or as much as the limits allow; args as of
-    `design_gradient_index`.
-
-    Raises:
-        InputError: as of `refuse_index_design`.
-    """
-    refuse_index_design(scene, limits)
-    layer, (low, high) = transport_index(scene, target, control, cells), limits
-    spread, room = float(layer.max() - layer.min()), (1.0 - 2.0 * INSIDE) * (high - low)
-    return min(share, room / max(spread, 1e-300)) * layer + 0.5 * (low + high)
-
-
 class JointLoss:
     """Half the squared relative RMS and its gradient at unknowns x (n m + layers i j,), those of the surface first; 0 at the start.
 
     Args:
-        objective: of both; start: of the search.
+        objective: of both; lens: its index and thickness; start: of the search.
         weights: of the steps of surface and index; 0 keeps one as it is.
-        laplacian: the preconditioner, which a start by transport is better without.
     """
 
-    def __init__(
-        self, objective: IndexObjective, start: FirstValues, weights: tuple[float, float] = (1.0, 1.0), laplacian: bool = False
-    ):
-        self.objective, self.pixels = objective, objective.loss.target.numel()
+    def __init__(self, objective: LossOfLens, lens: Lens, start: FirstValues, weights: tuple[float, float] = BOTH):
+        self.objective, self.pixels, self.start = objective, objective.loss.target.numel(), start
         layers = [layer.contiguous() for layer in start.index.double().unbind(-1)]
         low, high = (torch.full_like(layers[0], limit) for limit in start.limits)
-        self.surface = FreeHeights(*start.bounds, start.heights, laplacian)
-        self.layers = [FreeHeights(low, high, layer, laplacian) for layer in layers]
-        lens, points = objective.scene.lens, start.heights.numel()
+        self.surface = FreeHeights(*start.bounds, start.heights)
+        self.layers = [FreeHeights(low, high, layer, laplacian=not weights[0]) for layer in layers]
+        points = start.heights.numel()
         by_surface = float(self.surface.span.mean()) * (lens.index - 1.0)
         by_index = (start.limits[1] - start.limits[0]) * (lens.offset.thickness - lens.z_in)
-        self.weights = weights[0], weights[1] * by_surface / by_index * math.sqrt(len(layers) * low.numel() / points)
+        alike = by_surface / by_index * math.sqrt(len(layers) * low.numel() / points)
+        self.weights = weights[0], weights[1] * (alike if weights[0] else 1.0)
         self.split = [points, len(layers) * low.numel()]
         #: By their value.
         self.evaluations: dict[float, Evaluation] = {}
@@ -122,62 +110,64 @@ class JointLoss:
         self.surface.y.data = of_surface.view(self.surface.y.shape).clone()
         for net, y in zip(self.layers, of_index.view(len(self.layers), *self.layers[0].y.shape), strict=True):
             net.y.data = y.clone()
-        return self.surface(), torch.stack([net() for net in self.layers], -1)
+        values = torch.stack([net() for net in self.layers], -1)
+        return self.surface() if self.weights[0] else self.start.heights, values
 
     def __call__(self, x: Tensor) -> tuple[float, Tensor]:
-        (heights, values), name = self.lens(x), self.objective.name
+        heights, values = self.lens(x)
         try:
-            found = self.objective.evaluate({EXIT: heights.detach(), name: values.detach()})
+            found = self.objective.evaluate({EXIT: heights.detach(), INDEX: values.detach()})
         except NoLight:
             if not self.is_lit:
                 raise
             return math.inf, torch.zeros_like(x)  # treated as too long by the line search
         relative, self.is_lit = found.loss * self.pixels, True
-        (by_surface,) = pull_back([heights], [self.surface.y], [found.gradients[EXIT]])
-        by_index = torch.stack(pull_back([values], [net.y for net in self.layers], [found.gradients[name]]))
-        blocks = [weight * by.reshape(-1) for weight, by in zip(self.weights, (by_surface, by_index), strict=True)]
+        by = {name: gradient.to(x.device) for name, gradient in found.gradients.items()}
+        of_surface = torch.zeros_like(self.surface.y)
+        if self.weights[0]:
+            (of_surface,) = pull_back([heights], [self.surface.y], [by[EXIT]])
+        of_index = torch.stack(pull_back([values], [net.y for net in self.layers], [by[INDEX]]))
+        blocks = [weight * part.reshape(-1) for weight, part in zip(self.weights, (of_surface, of_index), strict=True)]
         value = 0.5 * relative * relative
         self.evaluations[value] = found
         return value, self.pixels * relative * torch.cat(blocks)
 
 
 def design_graded_lens(
-    scene: Scene,
-    field: HeightField,
-    target: np.ndarray,
+    objective: LossOfLens,
+    lens: Lens,
     start: FirstValues,
+    weights: tuple[float, float] = BOTH,
     *,
-    rays: int,
     iterations: int,
-    seed: int = 0,
-    limits: Limits | None = None,
-    how: LossImage | None = None,
     known: Mapping[str, Tensor] = MappingProxyType({}),
     on_iteration: OnIteration = lambda k, loss, on_screen, image: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> IndexAndExit:
-    """Design index and exit for a picture.
+    """Design the index, and the exit with it, for a picture: at most so many iterations, until there is no progress.
 
     Args:
-        scene: a plane wave, the lens and the screen; field: spline spaces of the exit.
-        target: (n_x, n_y) irradiance on the screen's pixels.
-        rays: traced in each iteration; seed: of the rays; limits: of the surface; how: the image is rendered.
+        objective, lens, weights: as of a `JointLoss`.
         known: the state of an earlier search, which is continued instead of one from `start`; empty for none.
-        on_iteration, stop: as of `design_gradient_index`.
+        on_iteration: see `OnIteration`; stop: called before every iteration; True ends the design.
 
     Raises:
         CausticError: no light reaches the screen.
-        InputError: `known` is of other unknowns, or as of `refuse_index_design`.
+        InputError: `known` is of other unknowns.
     """
-    refuse_index_design(scene, start.limits)
     if known:
         start = replace(start, **{name: known[name] for name in BEGUN})
-    objective = IndexObjective(scene, target, volume(scene, start.index), rays, seed, field, limits, how)
-    loss = JointLoss(objective, start)
+    loss = JointLoss(objective, lens, start, weights)
     search = LBFGS(loss, torch.zeros(sum(loss.split), dtype=torch.float64))
     if known:
         search.load({name: value for name, value in known.items() if name not in BEGUN})
-    iterate(search, loss.evaluations, iterations, on_iteration, stop)
+    for k in range(iterations):
+        loss.evaluations.clear()
+        if stop() or not search.step():
+            break
+        assert search.f is not None
+        found = loss.evaluations[search.f]
+        on_iteration(k + 1, found.loss, found.on_screen, found.image)
     with torch.no_grad():
         heights, values = loss.lens(search.x)
-    return IndexAndExit(volume(scene, values), heights, search.state() | {name: getattr(start, name) for name in BEGUN})
+    return IndexAndExit(values, heights, search.state() | {name: getattr(start, name) for name in BEGUN})

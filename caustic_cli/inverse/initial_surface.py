@@ -414,6 +414,38 @@ def extended(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Surface:
     return heights
 
 
+@dataclass(frozen=True, eq=False)
+class TurnedLight:
+    """Light on the corners x (n,), y (m,), mm, of cells over the offset surface, and where transport sends it."""
+
+    x: np.ndarray
+    y: np.ndarray
+    #: Directions inside the glass there, three (n, m) arrays.
+    inside: tuple[np.ndarray, ...]
+    #: A function of points x, y, z (n, m), mm, near the corners that returns the directions, of any length, to the picture.
+    towards: Callable[..., tuple]
+
+
+def turned_light(scene: Scene, target: np.ndarray, cells: int) -> TurnedLight:
+    """The light of the centre of the source on the offset surface, and the directions in which it has to leave for a picture.
+
+    Args:
+        scene, target: as of `first_surface`; cells: along the lens' longer side.
+
+    Raises:
+        InputError: the picture cannot be reached by refraction.
+    """
+    grid = _Grid.of(*seen_by_light(scene, target), cells)
+    light, directions = grid.incident(grid.offset)
+    mean, (mx, my) = float(grid.offset.mean()), grid.middle
+    found, projection, screen = grid.solved(light, directions, mean), grid.projection(mean), grid.scene.screen
+    centre = screen.shift if projection is None else projection.projected_target(grid.target)[2]
+    u, v = (t + e + c for t, e, c in zip((found.transport.x, found.transport.y), found.shift, centre, strict=True))
+    ahead = (lambda x, y, z: (u - x, v - y, screen.z - z)) if projection is None else projection.directions_to(u, v)
+    inside = tuple(np.broadcast_to(c, u.shape) for c in directions or (0.0, 0.0, 1.0))
+    return TurnedLight(*grid.places, inside, lambda x, y, z: ahead(x - mx, y - my, z))
+
+
 def net_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, field: HeightField) -> Tensor:
     """Control heights (n, m) of the surface with these heights at corners x (k,), y (l,): z (k, l), mm, `extended` beyond them."""
     values = torch.from_numpy(extended(x, y, z)(*(c.numpy() for c in field.control_xy())))

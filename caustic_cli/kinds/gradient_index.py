@@ -20,16 +20,25 @@ from caustic_cli.config.default_stages import Table, refinement, transport_cells
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
-from caustic_cli.inverse.graded_lens import FirstValues, design_graded_lens, initial_index
-from caustic_cli.inverse.gradient_index import OnIteration, design_gradient_index
+from caustic_cli.inverse.graded_lens import (
+    BOTH,
+    INDEX_ALONE,
+    FirstValues,
+    IndexAndExit,
+    LossOfLens,
+    OnIteration,
+    design_graded_lens,
+)
+from caustic_cli.inverse.gradient_index import index_of_plate, shared_index, with_index
 from caustic_cli.inverse.initial_surface import InitialSurface
+from caustic_cli.inverse.target import grey
 from caustic_cli.kinds.defaults import Defaults
-from caustic_cli.kinds.surface import Described, OneSurface
+from caustic_cli.kinds.elements import AmongElements
+from caustic_cli.kinds.surface import Described
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics import ranks
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.scene import Scene
-from caustic_cli.scene.gradient import Gradient
 from caustic_cli.schema.table import LensSettings, ScreenSettings, check, check_all
 
 manufacture = OnDemand("caustic_cli.studies.manufacture")
@@ -39,16 +48,29 @@ HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS = 0.05, 3, 2, 768
 RAYS_BENT, ITERATIONS = 16, 24  # largest number of rays per pixel, since they cost more; and iterations
 
 
-class IndexPlate(OneSurface):
-    """A plate with a designed index; its surface is flat."""
+class IndexPlate(AmongElements):
+    """A plate with a designed index; its surface is flat.
+
+    Args:
+        index: number of control values along x and y, and range, of the index.
+    """
 
     in_stages = False
     #: What a user may call the start.
     starts: tuple[str, ...] = ("offset", "transport")
 
+    def __init__(self, *args: Any, index: tuple[tuple[int, int], tuple[float, float]], **more: Any):
+        self.index = index
+        super().__init__(*args, **more)
+
     @classmethod
     def applies(cls, s: Settings) -> bool:
         return s.lens.gradient == "free"
+
+    @classmethod
+    def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
+        lens = described.settings.lens
+        return {"index": (lens.index_control, lens.index_range)} | super().further(described, scene)
 
     @classmethod
     def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
@@ -73,9 +95,7 @@ class IndexPlate(OneSurface):
     @classmethod
     def complete(cls, d: Defaults) -> None:
         """L-BFGS from optimal transport, on rays."""
-        s, design = d.s, d.design
-        if not d.source.collimated:
-            raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s.source.type}")
+        design = d.design
         check("design.waves", design.waves)
         if design.get("start", "transport") not in cls.starts:
             raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design.start}")
@@ -84,6 +104,11 @@ class IndexPlate(OneSurface):
             stage = cls.default_stage(d)
             rays = d.rays or min(stage["rays"], RAYS_BENT * math.prod(d.resolution))
             d.set_stages([stage | {"rays": rays, "oversample": min(4, stage["oversample"])}])
+
+    @classmethod
+    def spread(cls, d: Defaults) -> bool:
+        """Its blur is that behind straight rays."""
+        return False
 
     @classmethod
     def complete_surface(cls, d: Defaults) -> None:
@@ -116,7 +141,7 @@ class IndexPlate(OneSurface):
             stop: called before every iteration; on_iteration: after.
 
         Raises:
-            InputError: as of `design_gradient_index`.
+            InputError: as of `start_of_index`.
         """
         limit = time_limit if math.isinf(time_limit) else 2.0 * time_limit / 3.0
         before, now = state.seconds, State(self.first_exit(state), total=state.total, iteration=state.total)
@@ -156,30 +181,45 @@ class IndexPlate(OneSurface):
         gradient = self.scene.lens.gradient
         return None if gradient is None else gradient.volume
 
-    @property
-    def _cells(self) -> int:
-        """Source cells of the transport for the initial index."""
-        return transport_cells(self.stages[-1].rays, False, least=self.effort.source_cells)
+    @cached_property
+    def initial_index(self) -> Tensor:
+        """Control values (n, m) of the initial index."""
+        cells = transport_cells(self.stages[-1].rays, False, least=self.effort.source_cells)
+        return self.start_of_index(self._blank, grey(self.target.numpy()), *self.index, cells)
+
+    #: What finds them, from scene, target, number and range of the control values and source cells.
+    start_of_index: Callable[..., Tensor] = staticmethod(index_of_plate)
+    #: Of the unknowns, see `inverse.graded_lens.JointLoss`.
+    weights = INDEX_ALONE
 
     def search(
         self, lens: LensSettings, state: State, now: State, iterations: int, done: OnIteration, stop: Callable[[], bool]
     ) -> np.ndarray:
         """Iterate from the index and the exit of `state`; the control values (n, m, layers) found, and the exit in `now`."""
-        design = design_gradient_index(
-            self._blank,
-            self.target.numpy(),
-            lens.index_control,
-            lens.index_layers,
-            lens.index_range,
-            cells=self._cells,
+        begun = self._designed if state.total else None
+        first = self.initial_index[:, :, None].expand(-1, -1, lens.index_layers) if begun is None else torch.from_numpy(begun)
+        start = FirstValues(now.heights, first.contiguous(), self.bounds(0), self.index[1])
+        found = design_graded_lens(
+            self.objective_of(with_index(self._blank, start.index)),
+            self.scene.lens,
+            start,
+            self.weights,
             iterations=iterations,
-            rays=self.stages[-1].rays,
-            seed=self.options.seed,
-            begin=self._designed if state.total else None,
+            known=state.optimizer,
             on_iteration=done,
             stop=stop,
         )
-        return design.index.coefficients.numpy()
+        now.optimizer = found.state
+        self.keep(found, now)
+        return found.index.numpy()
+
+    def objective_of(self, scene: Scene) -> LossOfLens:
+        """The loss in a scene whose lens has an index that varies."""
+        last = len(self.stages) - 1
+        return self.on_rays(self.lit(scene, last), last, self.field(last), self.target, self.stages[last].rays)
+
+    def keep(self, found: IndexAndExit, now: State) -> None:
+        """Take the exit that was found."""
 
     def words(self, lens: LensSettings) -> str:
         """What is designed, before it is."""
@@ -190,26 +230,15 @@ class IndexPlate(OneSurface):
 
 
 class GradedLens(IndexPlate):
-    """A lens whose index and exit are designed together.
-
-    Args:
-        index: control values along x and y, and range, of the index.
-    """
+    """A lens whose index and exit are designed together."""
 
     starts = ("transport",)
-
-    def __init__(self, *args: Any, index: tuple[tuple[int, int], tuple[float, float]], **more: Any):
-        self.index_control, self.index_range = index
-        super().__init__(*args, **more)
+    start_of_index = staticmethod(shared_index)
+    weights = BOTH
 
     @classmethod
     def applies(cls, s: Settings) -> bool:
         return super().applies(s) and s.lens.with_surface
-
-    @classmethod
-    def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
-        lens = described.settings.lens
-        return {"index": (lens.index_control, lens.index_range)} | super().further(described, scene)
 
     @classmethod
     def sides(cls, lens: LensSettings) -> LensSettings:
@@ -227,39 +256,15 @@ class GradedLens(IndexPlate):
         """With the net and the iterations of a surface alone."""
         return cls.refinement(d, cls.creased(d, []))[-1]
 
-    @cached_property
-    def initial_index(self) -> Tensor:
-        """Control values (n, m) of the initial index."""
-        return initial_index(self._blank, self.target.numpy(), self.index_control, self.index_range, self._cells)
-
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
-        gradient = Gradient("volume", volume=self.initial_index.numpy())
-        return super().solved(replace(scene, lens=replace(scene.lens, gradient=gradient)), goal, cells, fixed, seconds)
+        """Of the given thickness, which that of the index is, too."""
+        return super().solved(with_index(scene, self.initial_index), goal, cells, True, seconds)
 
     def first_exit(self, state: State) -> Tensor:
         return state.heights
 
-    def search(
-        self, lens: LensSettings, state: State, now: State, iterations: int, done: OnIteration, stop: Callable[[], bool]
-    ) -> np.ndarray:
-        begun = self._designed if state.total else None
-        first = self.initial_index[:, :, None].expand(-1, -1, lens.index_layers) if begun is None else torch.from_numpy(begun)
-        found = design_graded_lens(
-            self._blank,
-            self.field(0),
-            self.target.numpy(),
-            FirstValues(state.heights, first.contiguous(), self.bounds(0), lens.index_range),
-            rays=self.stages[-1].rays,
-            iterations=iterations,
-            seed=self.options.seed,
-            limits=self.options.limits,
-            how=self.stages[-1].rendering,
-            known=state.optimizer,
-            on_iteration=done,
-            stop=stop,
-        )
-        now.heights, now.optimizer = self.feasible(0, found.heights), found.state
-        return found.index.coefficients.numpy()
+    def keep(self, found: IndexAndExit, now: State) -> None:
+        now.heights = self.feasible(0, found.heights)
 
     def further_figures(self, designer: Designer, state: State) -> dict[str, Any]:
         return manufacture.wall_and_stock(*trace_arguments(self.scene, designer.field(state.stage), state.heights))
