@@ -7,8 +7,15 @@ from itertools import combinations, product
 from types import SimpleNamespace
 
 import numpy as np
+import torch
 from PIL import Image
 
+from caustic_cli.optics.frames import Pose
+from caustic_cli.optics.gradient.fields import SplineIndex
+from caustic_cli.optics.gradient.medium import GradientMedium
+from caustic_cli.optics.surfaces import Plane
+from caustic_cli.optics.system import ENTRANCE, EXIT, Element, System
+from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.base import looked_up
 
 
@@ -25,6 +32,16 @@ def begun(project, *_) -> SimpleNamespace:
     return SimpleNamespace(
         project=project, scene=None, field=None, heights=None, target=None, state=SimpleNamespace(heights=None), figures=figures
     )
+
+
+def between_planes(scene: Scene, values: torch.Tensor) -> System:
+    """A plate with control values (n, m, layers) of its index, its sides planes instead of height fields."""
+    lens = scene.lens
+    index = SplineIndex(values, lens.half_size, lens.offset.thickness - lens.z_in)
+    inside = GradientMedium(lens.index, gradient=index)
+    front = Element(ENTRANCE, Plane(), lens.opening, behind=inside, pose=Pose((0.0, 0.0, lens.z_in)))
+    back = Element(EXIT, Plane(), lens.opening, pose=Pose((0.0, 0.0, lens.offset.thickness)))
+    return System((scene.source,), (front, back), (scene.screen,), scene.light)
 
 
 def pairwise(*lists: Sequence) -> list[tuple]:

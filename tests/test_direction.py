@@ -501,7 +501,6 @@ def test_a_lens_with_a_gradient(in_tmp, capfd):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--source-tilt", "20,0", "--gradient", "free"), "cannot be combined with --gradient"),
         (("--source-tilt", "85,0"), "-80 to 80"),
         (("--source-tilt", "70,60"), "within 80 degrees"),
         (("--source-tilt", "20,0", "--source", "point"), "tilt"),

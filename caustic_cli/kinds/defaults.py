@@ -127,17 +127,17 @@ class Defaults:
     @cached_property
     def shifts(self) -> bool:
         """Whether the source's extent only shifts the image."""
-        return source_spread(self._scene) is not None
+        return source_spread(self.scene) is not None
 
     @property
     def by_rows(self) -> bool:
         """Whether rays of the source's centre are not intersected with the surface one by one."""
-        return evaluates_by_rows(self._scene)
+        return evaluates_by_rows(self.scene)
 
     def fewer_rays(self, spread: bool) -> int:
         """By what factor rays are fewer than those of a plane wave: where every one has to be intersected with the surface, and of
         a near source, whose start takes longer the more there are; spread: those of the source's centre are traced."""
-        scene = self._scene
+        scene = self.scene
         centre = replace(scene, source=point_source(scene)) if spread else scene
         if centre.source.collimated:
             return 1
@@ -147,7 +147,7 @@ class Defaults:
         )
 
     @property
-    def _scene(self) -> Scene:
+    def scene(self) -> Scene:
         """The scene with some control net."""
         lens = self.s.lens.filled(control=[LEAST_SPANS] * 2)
         return replace(build_scene(self.s.changed(lens=lens)), source=self.source)

@@ -29,7 +29,7 @@ from caustic_cli.inverse.graded_lens import (
     OnIteration,
     design_graded_lens,
 )
-from caustic_cli.inverse.gradient_index import index_of_plate, shared_index, with_index
+from caustic_cli.inverse.gradient_index import index_of_plate, layers_along, shared_index, with_index
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.target import grey
 from caustic_cli.kinds.defaults import Defaults
@@ -52,14 +52,14 @@ class IndexPlate(AmongElements):
     """A plate with a designed index; its surface is flat.
 
     Args:
-        index: number of control values along x and y, and range, of the index.
+        index: number of control values along x and y, their range, and their layers along z.
     """
 
     in_stages = False
     #: What a user may call the start.
     starts: tuple[str, ...] = ("offset", "transport")
 
-    def __init__(self, *args: Any, index: tuple[tuple[int, int], tuple[float, float]], **more: Any):
+    def __init__(self, *args: Any, index: tuple[tuple[int, int], tuple[float, float], int], **more: Any):
         self.index = index
         super().__init__(*args, **more)
 
@@ -70,7 +70,7 @@ class IndexPlate(AmongElements):
     @classmethod
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
         lens = described.settings.lens
-        return {"index": (lens.index_control, lens.index_range)} | super().further(described, scene)
+        return {"index": (lens.index_control, lens.index_range, lens.index_layers)} | super().further(described, scene)
 
     @classmethod
     def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
@@ -99,6 +99,8 @@ class IndexPlate(AmongElements):
         check("design.waves", design.waves)
         if design.get("start", "transport") not in cls.starts:
             raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design.start}")
+        if "index_layers" not in d.lens:
+            d.s = d.s.changed(lens=d.lens.changed(index_layers=layers_along(d.scene, d.lens.index_control)))
         cls.complete_surface(d)
         if "stages" not in design:
             stage = cls.default_stage(d)
@@ -183,11 +185,12 @@ class IndexPlate(AmongElements):
 
     @cached_property
     def initial_index(self) -> Tensor:
-        """Control values (n, m) of the initial index."""
+        """Control values (n, m, layers) of the initial index."""
         cells = transport_cells(self.stages[-1].rays, False, least=self.effort.source_cells)
-        return self.start_of_index(self._blank, grey(self.target.numpy()), *self.index, cells)
+        control, limits, layers = self.index
+        return self.start_of_index(self._blank, grey(self.target.numpy()), control, limits, cells, layers)
 
-    #: What finds them, from scene, target, number and range of the control values and source cells.
+    #: What finds them, from scene, target, number along x and y and range of the control values, source cells, and layers.
     start_of_index: Callable[..., Tensor] = staticmethod(index_of_plate)
     #: Of the unknowns, see `inverse.graded_lens.JointLoss`.
     weights = INDEX_ALONE
@@ -197,8 +200,8 @@ class IndexPlate(AmongElements):
     ) -> np.ndarray:
         """Iterate from the index and the exit of `state`; the control values (n, m, layers) found, and the exit in `now`."""
         begun = self._designed if state.total else None
-        first = self.initial_index[:, :, None].expand(-1, -1, lens.index_layers) if begun is None else torch.from_numpy(begun)
-        start = FirstValues(now.heights, first.contiguous(), self.bounds(0), self.index[1])
+        first = self.initial_index if begun is None else torch.from_numpy(begun)
+        start = FirstValues(now.heights, first, self.bounds(0), self.index[1])
         found = design_graded_lens(
             self.objective_of(with_index(self._blank, start.index)),
             self.scene.lens,
