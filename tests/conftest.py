@@ -95,6 +95,8 @@ def pytest_sessionstart(session):
 LONG = (
     "faults/test_kill.py",
     "test_a_design_killed_before_its_first_checkpoint_is_begun_anew[index]",
+    "test_four_iterations_are_two_and_two_bitwise[tilted]",
+    "test_four_iterations_are_two_and_two_bitwise[near source and surface, folded]",
     "test_a_flat_mirror_excludes_nothing_that_a_lens_has_by_itself",
     "test_surfaces_of_two_lenses_are_shaped_together",
     "test_the_commands_of_a_chapter_run[5-accuracy]",

@@ -69,14 +69,14 @@ def refuse_index_design(scene: Scene, limits: tuple[float, float]) -> None:
 def layers_along(scene: Scene, control: tuple[int, int]) -> int:
     """Layers of control values along z by which an index follows the light of the centre of the source to the detail of its control
     values along x and y: 1 where the light departs from the axis by less than that."""
-    lens, spans = scene.lens, min(n - min(DEGREE, n - 1) for n in control)
+    lens, depth = scene.lens, scene.lens.offset.thickness - scene.lens.z_in
     x, y = (np.linspace(-r, r, PLACES) for r in lens.half_size)
     _, directions = incident(scene, x, y, np.full((PLACES, PLACES), lens.offset.thickness))
     if directions is None:
         return 1
-    dx, dy, dz = directions
-    along = (lens.offset.thickness - lens.z_in) * float((np.hypot(dx, dy) / dz).max())
-    apart = round(along * spans / (2.0 * min(lens.half_size)))
+    *across, along = directions
+    finest = [2.0 * r / (n - min(DEGREE, n - 1)) for r, n in zip(lens.half_size, control, strict=True)]
+    apart = round(max(depth * float(np.abs(c / along).max()) / w for c, w in zip(across, finest, strict=True)))
     return min(MOST_LAYERS, max(DEGREE, apart) + 1) if apart > 1 else 1
 
 
@@ -129,7 +129,11 @@ def transport_index(scene: Scene, target: np.ndarray, control: tuple[int, int], 
     Args:
         scene: its lens has one index; target: (n_x, n_y) irradiance on its screen; control: control values along x and y.
         cells: source cells of the transport along the longer side; layers: control values along z.
+
+    Of separate sources, which no source at their centre represents, the index is even.
     """
+    if scene.source.apart:
+        return torch.zeros(*control, layers, dtype=torch.float64)
     lens, exit = scene.lens, scene.lens.offset.thickness
     net = HeightField.of(replace(lens, control=control, degree=(3, 3), knots=None, gradient=None))
     light, depth = turned_light(scene, target, cells), exit - lens.z_in
