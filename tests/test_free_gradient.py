@@ -21,6 +21,9 @@ from scipy.interpolate import NdBSpline
 from caustic_cli import cli, load
 from caustic_cli.inverse.graded_lens import INDEX
 from caustic_cli.inverse.gradient_index import layers_along, transport_index, with_index
+from caustic_cli.kinds import problem_of
+from caustic_cli.kinds.gradient_index import IndexPlate
+from caustic_cli.kinds.robust import RobustPlate
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -266,3 +269,30 @@ def test_a_picture_in_colour_is_designed(here, capfd):
     seen = expose(lens.scene, lens.field, lens.heights, rays_of(lens.scene, "grid", 20_000)).image
     assert seen.shape == (3, 24, 24)
     assert np.load("colour/index.npy").shape == (27, 27, 1)
+
+
+def test_a_robust_index_is_judged_with_its_errors(here, capfd):
+    """The loss of the design: that of the lens and of lenses with errors of index and thickness, made by hand; and its gradient."""
+    Path("errors.toml").write_text("[index]\nsigma = 0.004\n[thickness]\nsigma = 0.1\n[throw]\nhalf_width = 5.0\n")
+    options = ("--quality", "draft", "--robust", "errors.toml", "--iterations", "2")
+    figures = run(capfd, "design", "blob.png", *TINY, *options, "-o", "robust")
+    assert figures["relative_rms"] < 0.3
+    problem = problem_of(load("robust").project)
+    assert isinstance(problem, RobustPlate)
+    values = torch.from_numpy(np.load("robust/index.npy"))
+    mixture = problem.objective_of(problem.scene)
+    flat = torch.full((4, 4), THICK, dtype=torch.float64)
+    found = mixture.evaluate({EXIT: flat, INDEX: values})
+    losses = []
+    for member in mixture.members:
+        scene, by = member.objective.objective.scene, member.objective.by
+        exact = with_index(scene, values + by)
+        objective = IndexPlate.objective_of(problem, exact)
+        losses.append(objective.evaluate({EXIT: flat + member.added, INDEX: values + by}).loss)
+    assert len({m.objective.by for m in mixture.members}) == 5
+    weights = np.array([0.9, *[0.025] * 4])
+    assert found.loss == pytest.approx(float(np.sqrt(weights @ np.square(losses))), rel=1e-9)
+    x = torch.linspace(0.0, 1.0, 27, dtype=torch.float64)
+    way = 1e-3 * torch.outer(torch.sin(3.0 * x), torch.cos(4.0 * x))[:, :, None]
+    ahead, back = (mixture.evaluate({EXIT: flat, INDEX: values + h * way}).loss for h in (1e-4, -1e-4))
+    assert (ahead - back) / 2e-4 == pytest.approx(float((found.gradients[INDEX] * way).sum()), rel=1e-4)

@@ -126,7 +126,6 @@ def test_a_file_of_indices_is_kept(capfd):
             ("--gradient", "free", "--element", "lens z=20 radius=50,inf free=front"),
             "--gradient free cannot be combined with [[element]] free",
         ),
-        (("--gradient", "free", "--robust", "errors.toml"), "--robust errors.toml averages over errors of a designed surface"),
         (("--gradient", "free", "--start", "old.npz"), "--start of a free gradient must be transport"),
         (("--index-control", "12"), "--index-control belongs to --gradient free"),
         (("--gradient", "lens"), "must be one of"),
@@ -143,7 +142,6 @@ def test_a_file_of_indices_is_kept(capfd):
 def test_what_cannot_be_is_refused_in_a_line(capfd, options, words):
     np.save("text.npy", np.full((4, 4), "1.5"))
     np.save("complex.npy", np.full((4, 4), 1.5j))
-    Path("errors.toml").write_text("[index]\nsigma = 0.001\n")
     Path("old.npz").write_bytes(b"any")
     message = run(capfd, "design", "blob.png", *TINY, *options, "-o", "x.caustic", code=2)
     assert words in message and not (Path("x.caustic") / "index.npy").exists()

@@ -67,7 +67,6 @@ EXCLUDED: dict[str, dict[str, str]] = {
     "lens.gradient free": {
         "lens.mirror": "⟨lens.gradient⟩ free needs a lens: light never enters a mirror",
         "lens.array": "⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat",
-        "design.robust": "{said} averages over errors of a designed surface, but ⟨lens.gradient⟩ free designs the index",
         **dict.fromkeys(("design.network", "design.optimizer"), "⟨{path}⟩ of a free gradient must be {default}, got {value}"),
         "design.waves on": "⟨design.waves⟩ on refines heights, but ⟨lens.gradient⟩ free designs the index, by rays",
     },

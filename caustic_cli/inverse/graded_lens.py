@@ -24,21 +24,19 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from caustic_cli.inverse.lbfgs import LBFGS
-from caustic_cli.inverse.losses import ColorLoss, Loss, NoLight
-from caustic_cli.inverse.objective import Evaluation
+from caustic_cli.inverse.losses import NoLight
+from caustic_cli.inverse.objective import Evaluation, LossOfLens
 from caustic_cli.inverse.parametrisation import FreeHeights
 from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.system import ENTRANCE, EXIT
-from caustic_cli.optics.trace import Parameters
 from caustic_cli.scene import Lens
 
-#: Name of the index among the parameters of a trace (`gradient.medium.index_name`).
+#: Name of the control values (i, j, layers) of the index among the parameters of a trace (`gradient.medium.index_name`).
 INDEX = f"{ENTRANCE}.index"
 #: Parts of a `FirstValues` that the state of a search holds, since its unknowns count from there.
 BEGUN = ("heights", "index")
@@ -46,16 +44,6 @@ BEGUN = ("heights", "index")
 BOTH, INDEX_ALONE = (1.0, 1.0), (0.0, 1.0)
 #: Called with the iteration, the loss, the fraction of the light on the screen and the image there.
 OnIteration = Callable[[int, float, float, Tensor | None], None]
-
-
-class LossOfLens(Protocol):
-    """The loss as a function of the heights of the exit, EXIT: (n, m) mm, and of the control values of the index, INDEX: (i, j,
-    layers)."""
-
-    loss: Loss | ColorLoss
-
-    def evaluate(self, parameters: Parameters) -> Evaluation:
-        """Value and gradients."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +72,7 @@ class JointLoss:
     """Half the squared relative RMS and its gradient at unknowns x (n m + layers i j,), those of the surface first; 0 at the start.
 
     Args:
-        objective: of both; lens: its index and thickness; start: of the search.
+        objective: of EXIT and INDEX; lens: its index and thickness; start: of the search.
         weights: of the steps of surface and index; 0 keeps one as it is.
     """
 

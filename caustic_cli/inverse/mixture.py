@@ -12,20 +12,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import EllipsisType
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from caustic_cli.inverse.objective import Evaluation, LossOfHeights
+from caustic_cli.inverse.objective import Evaluation, LossOfHeights, LossOfLens
 from caustic_cli.optics import ranks
 from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.trace import Parameters
 
 
 @dataclass(frozen=True, eq=False)
 class Member:
     """One member of a mixture."""
 
-    objective: LossOfHeights
+    #: Of heights alone, or with further parameters.
+    objective: LossOfHeights | LossOfLens
     #: Of its loss in the mean.
     weight: float
     #: Of its light in the fraction on the screen.
@@ -37,6 +40,15 @@ class Member:
     #: What it adds to these, mm.
     added: Tensor | float = 0.0
 
+    def at(self, heights: Tensor, further: Parameters) -> Evaluation:
+        """Its evaluation at the design's heights, and at further parameters of the trace if there are any."""
+        own = heights[self.where] + self.added
+        return (
+            cast(LossOfLens, self.objective).evaluate({EXIT: own, **further})
+            if further
+            else cast(LossOfHeights, self.objective)(own)
+        )
+
 
 class Mixture:
     """The mean over members with the exponent `power`, as a function of the heights; see above."""
@@ -47,12 +59,20 @@ class Mixture:
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value, gradient, fraction of the light on the screen and image at heights mm float64."""
-        found = ranks.divided([partial(member.objective, heights[member.where] + member.added) for member in self.members])
+        return self.evaluate({EXIT: heights})
+
+    def evaluate(self, parameters: Parameters) -> Evaluation:
+        """The same with gradients by further parameters of the trace, which are those of every member."""
+        heights = parameters[EXIT]
+        further = {name: value for name, value in parameters.items() if name != EXIT}
+        found = ranks.divided([partial(member.at, heights, further) for member in self.members])
         loss = sum(member.weight * e.loss**self.power for member, e in zip(self.members, found, strict=True)) ** (1.0 / self.power)
-        gradient = found[0].gradient.new_zeros(heights.shape)
+        gradients = {name: found[0].gradients[EXIT].new_zeros(value.shape) for name, value in parameters.items()}
         for member, e in zip(self.members, found, strict=True):
             weight = member.weight * (e.loss / loss) ** (self.power - 1.0) if loss > 0 else 0.0
-            gradient[member.where] += weight * e.gradient
+            gradients[EXIT][member.where] += weight * (e.gradients[EXIT] if further else e.gradient)
+            for name in further:
+                gradients[name] += weight * e.gradients[name]
         on_screen = sum(member.seen * e.on_screen for member, e in zip(self.members, found, strict=True))
         image = torch.stack([member.shown * e.image for member, e in zip(self.members, found, strict=True) if member.shown]).sum(0)
-        return Evaluation(loss, {EXIT: gradient}, on_screen, image)
+        return Evaluation(loss, gradients, on_screen, image)

@@ -70,6 +70,15 @@ class LossOfHeights(Protocol):
         """Value and gradient at heights, mm."""
 
 
+class LossOfLens(Protocol):
+    """The loss as a function of the heights of the exit and of further parameters of the trace."""
+
+    loss: Loss | ColorLoss
+
+    def evaluate(self, parameters: Parameters) -> Evaluation:
+        """Value and gradients."""
+
+
 def penalty_of(scene: Scene, field: HeightField, loss: str, limits: Limits, device: str | torch.device) -> Penalty:
     """The penalty terms of the surface, from a loss and the limits."""
     terms = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]

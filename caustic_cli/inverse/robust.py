@@ -19,7 +19,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.mixture import Member, Mixture
-from caustic_cli.inverse.objective import LossOfHeights
+from caustic_cli.inverse.objective import LossOfHeights, LossOfLens
 from caustic_cli.optics.form_error import FormErrors
 from caustic_cli.optics.misalignment import Misalignment, reason_ignored
 from caustic_cli.optics.surfaces import HeightField
@@ -35,7 +35,11 @@ PURPOSE = 2
 
 
 def robust_objective(
-    objective: Callable[[Scene, Tensor], LossOfHeights], scene: Scene, field: HeightField, initial: Tensor, tolerances: Tolerances
+    objective: Callable[[Scene, Tensor], LossOfHeights | LossOfLens],
+    scene: Scene,
+    field: HeightField,
+    initial: Tensor,
+    tolerances: Tolerances,
 ) -> Mixture:
     """The loss over draws as a function of the heights; see above.  Its image is that without errors.
 

@@ -16,7 +16,9 @@ from caustic_cli.kinds.surface import Described, OneSurface
 #: All kinds beside a single surface, each with the setting or section without which it does not apply and is not loaded; a design
 #: is of the first that applies.
 KINDS = (
+    ("lens.with_surface", "robust.RobustGradedLens"),
     ("lens.with_surface", "gradient_index.GradedLens"),
+    ("lens.gradient", "robust.RobustPlate"),
     ("lens.gradient", "gradient_index.IndexPlate"),
     ("design.robust", "robust.RobustTwoSidesAmongElements"),
     ("second", "two_sided.TwoSidesAmongElements"),

@@ -25,12 +25,12 @@ from caustic_cli.inverse.graded_lens import (
     INDEX_ALONE,
     FirstValues,
     IndexAndExit,
-    LossOfLens,
     OnIteration,
     design_graded_lens,
 )
 from caustic_cli.inverse.gradient_index import index_of_plate, layers_along, shared_index, with_index
 from caustic_cli.inverse.initial_surface import InitialSurface
+from caustic_cli.inverse.objective import LossOfLens
 from caustic_cli.inverse.target import grey
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.elements import AmongElements

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from caustic_cli.config.settings import Settings
-from caustic_cli.inverse.objective import LossOfHeights
+from caustic_cli.inverse.graded_lens import INDEX
+from caustic_cli.inverse.objective import Evaluation, LossOfHeights, LossOfLens
 from caustic_cli.inverse.robust import robust_objective
 from caustic_cli.kinds.elements import AmongElements, FreeElements
+from caustic_cli.kinds.gradient_index import GradedLens, IndexPlate
 from caustic_cli.kinds.lenslet_array import LensletArray
 from caustic_cli.kinds.surface import Described, OneSurface
 from caustic_cli.kinds.two_sided import TwoSides, TwoSidesAmongElements
 from caustic_cli.optics import ranks
+from caustic_cli.optics.trace import Parameters
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.section import content
 from caustic_cli.scene.tolerances import Tolerances
@@ -71,3 +75,30 @@ class RobustTwoSidesAmongElements(RobustSurface, TwoSidesAmongElements):
 
 class RobustArray(RobustSurface, LensletArray):
     """An array of lenslets, robust."""
+
+
+class Denser:
+    """The loss of a lens whose index is larger by this than its control values say."""
+
+    def __init__(self, objective: LossOfLens, by: float):
+        self.objective, self.by, self.loss = objective, by, objective.loss
+
+    def evaluate(self, parameters: Parameters) -> Evaluation:
+        """Value and gradients."""
+        return self.objective.evaluate({**parameters, INDEX: parameters[INDEX] + self.by})
+
+
+class RobustPlate(RobustSurface, IndexPlate):
+    """The index of a plate, robust."""
+
+    def objective_of(self, scene: Scene) -> LossOfLens:
+        def in_scene(one: Scene, _: Tensor) -> Denser:
+            return Denser(IndexPlate.objective_of(self, one), one.lens.index - scene.lens.index)
+
+        field = self.field(len(self.stages) - 1)
+        with ranks.alone():
+            return robust_objective(in_scene, scene, field, torch.zeros(field.shape, dtype=torch.float64), self.tolerances)
+
+
+class RobustGradedLens(RobustPlate, GradedLens):
+    """Index and exit, robust."""
