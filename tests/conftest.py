@@ -96,6 +96,7 @@ LONG = (
     "faults/test_kill.py",
     "test_a_design_killed_before_its_first_checkpoint_is_begun_anew[index]",
     "test_four_iterations_are_two_and_two_bitwise[tilted]",
+    "test_a_robust_index_is_judged_with_its_errors",
     "test_four_iterations_are_two_and_two_bitwise[near source and surface, folded]",
     "test_a_flat_mirror_excludes_nothing_that_a_lens_has_by_itself",
     "test_surfaces_of_two_lenses_are_shaped_together",

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config.default_stages import Table, refinement, transport_cells
+from caustic_cli.config.default_stages import Table, transport_cells
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
@@ -31,7 +31,7 @@ from caustic_cli.inverse.graded_lens import (
 from caustic_cli.inverse.gradient_index import index_of_plate, layers_along, shared_index, with_index
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.objective import LossOfLens
-from caustic_cli.inverse.target import grey
+from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.elements import AmongElements
 from caustic_cli.kinds.surface import Described
@@ -105,12 +105,13 @@ class IndexPlate(AmongElements):
         if "stages" not in design:
             stage = cls.default_stage(d)
             rays = d.rays or min(stage["rays"], RAYS_BENT * math.prod(d.resolution))
-            d.set_stages([stage | {"rays": rays, "oversample": min(4, stage["oversample"])}])
+            sampler = stage["sampler"] if d.source.sharp or cls.spread(d) else d.sampler
+            d.set_stages([stage | {"rays": rays, "sampler": sampler, "oversample": min(4, stage["oversample"])}])
 
     @classmethod
-    def spread(cls, d: Defaults) -> bool:
-        """Its blur is that behind straight rays."""
-        return False
+    def fine_net(cls, d: Defaults) -> bool:
+        """That of the index does."""
+        return True
 
     @classmethod
     def complete_surface(cls, d: Defaults) -> None:
@@ -121,7 +122,7 @@ class IndexPlate(AmongElements):
     @classmethod
     def default_stage(cls, d: Defaults) -> Table:
         """The stage unless it is given, before its rays are limited."""
-        return refinement(d.lens.control, d.rays, d.resolution, d.effort.refinement)[-1] | {"iterations": ITERATIONS}
+        return cls.refinement(d)[-1] | {"iterations": ITERATIONS}
 
     def iterate(
         self,
@@ -188,7 +189,7 @@ class IndexPlate(AmongElements):
         """Control values (n, m, layers) of the initial index."""
         cells = transport_cells(self.stages[-1].rays, False, least=self.effort.source_cells)
         control, limits, layers = self.index
-        return self.start_of_index(self._blank, grey(self.target.numpy()), control, limits, cells, layers)
+        return self.start_of_index(*self.unblurred(self._blank), control, limits, cells, layers)
 
     #: What finds them, from scene, target, number along x and y and range of the control values, source cells, and layers.
     start_of_index: Callable[..., Tensor] = staticmethod(index_of_plate)
@@ -217,9 +218,13 @@ class IndexPlate(AmongElements):
         return found.index.numpy()
 
     def objective_of(self, scene: Scene) -> LossOfLens:
-        """The loss in a scene whose lens has an index that varies."""
-        last = len(self.stages) - 1
-        return self.on_rays(self.lit(scene, last), last, self.field(last), self.target, self.stages[last].rays)
+        """The loss in a scene whose lens has an index that varies; the blur of its source is that behind a lens of one index."""
+        k = len(self.stages) - 1
+        scene, stage = self.lit(scene, k), self.stages[k]
+        spread = source_spread(replace(scene, lens=replace(scene.lens, gradient=None))) if stage.spread else None
+        if spread is not None:
+            return self.blurred(scene, k, spread)
+        return self.on_rays(scene, k, self.field(k), self.target, stage.rays)
 
     def keep(self, found: IndexAndExit, now: State) -> None:
         """Take the exit that was found."""
@@ -242,6 +247,10 @@ class GradedLens(IndexPlate):
     @classmethod
     def applies(cls, s: Settings) -> bool:
         return super().applies(s) and s.lens.with_surface
+
+    @classmethod
+    def fine_net(cls, d: Defaults) -> bool:
+        return d.fine_net
 
     @classmethod
     def sides(cls, lens: LensSettings) -> LensSettings:

@@ -53,6 +53,7 @@ from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.spread import Spread
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
@@ -385,9 +386,12 @@ class OneSurface(Problem):
     def on_spread(self, scene: Scene, k: int, initial: Tensor) -> Objective | None:
         """The objective of stage k on the image of the source's centre, convolved with that of the source; None where this is no
         good approximation."""
+        spread = source_spread(scene, self.field(k), initial)
+        return None if spread is None else self.blurred(scene, k, spread)
+
+    def blurred(self, scene: Scene, k: int, spread: Spread) -> Objective:
+        """The objective of stage k on the image of the source's centre, convolved with this point-spread function."""
         stage, o, field = self.stages[k], self.options, self.field(k)
-        if (spread := source_spread(scene, field, initial)) is None:
-            return None
         expected = best_irradiance(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
         scene, rays, spreads = regular_rays(scene, spread, stage, self.seed(k), self.device)
         blur = SourceBlur(spreads, expected)
@@ -435,18 +439,23 @@ class OneSurface(Problem):
         Raises:
             InputError: the picture cannot be reached.
         """
-        scene, goal, first = self.scene, grey(self.target.numpy()), self.stages[0]
-        spans = min(n - p for n, p in zip(first.control, scene.lens.degree, strict=True))
+        spans = min(n - p for n, p in zip(self.stages[0].control, self.scene.lens.degree, strict=True))
         rays, least = 0 if rough else max(s.rays for s in self.stages), self.effort.source_cells
-        cells = transport_cells(rays, not scene.source.parallel, 0 if rough else spans, least)
-        spread = source_spread(scene) if first.spread else None
-        if spread is not None:
-            light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
-            scene, goal = replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
-        surface, lens = self.solved(scene, goal, cells, fixed, seconds), self.scene.lens
+        cells = transport_cells(rays, not self.scene.source.parallel, 0 if rough else spans, least)
+        surface, lens = self.solved(*self.unblurred(self.scene), cells, fixed, seconds), self.scene.lens
         floors = lens.floors(*(c.numpy() for c in self.field(0).control_xy()))
         short = float((floors - surface.heights.numpy()).max())
         return replace(surface, heights=surface.heights + 1.01 * short) if fixed and short > 0 else surface
+
+    def unblurred(self, scene: Scene) -> tuple[Scene, np.ndarray]:
+        """A scene and the irradiance on its screen that its light is to give, where the stages convolve the image of the source's
+        centre: of this centre, on a screen with room for the blur, and the irradiance from which the blur makes the picture."""
+        goal = grey(self.target.numpy())
+        spread = source_spread(scene) if self.stages[0].spread else None
+        if spread is None:
+            return scene, goal
+        light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
+        return replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
         """`transport` of the light of a scene to an irradiance on its screen, with this number of source cells."""
