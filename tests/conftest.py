@@ -95,7 +95,8 @@ def pytest_sessionstart(session):
 LONG = (
     "faults/test_kill.py",
     "test_a_design_killed_before_its_first_checkpoint_is_begun_anew[index]",
-    "test_four_iterations_are_two_and_two_bitwise[tilted]",
+    *(f"test_four_iterations_are_two_and_two_bitwise[{name}" for name in ("tilted]", "extended source]")),
+    "test_free_gradient.py::test_a_picture_in_colour_is_designed",
     "test_a_robust_index_is_judged_with_its_errors",
     "test_four_iterations_are_two_and_two_bitwise[near source and surface, folded]",
     "test_a_flat_mirror_excludes_nothing_that_a_lens_has_by_itself",

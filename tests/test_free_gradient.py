@@ -228,6 +228,7 @@ def run(capfd, *arguments: str) -> dict:
     "options",
     [
         ("--throw", "inf"),
+        ("--source", "disc", "--source-angle", "0.3"),
         ("--source-tilt", "15,0", "--movie", "m.gif"),
         (
             "--with-surface",
@@ -241,7 +242,7 @@ def run(capfd, *arguments: str) -> dict:
             "mirror z=100 tilt=45,0",
         ),
     ],
-    ids=["far field", "tilted", "near source and surface, folded"],
+    ids=["far field", "extended source", "tilted", "near source and surface, folded"],
 )
 def test_four_iterations_are_two_and_two_bitwise(here, capfd, options):
     figures = run(capfd, "design", "blob.png", *TINY, *options, "--iterations", "4", "-o", "whole")
@@ -263,7 +264,11 @@ def test_a_picture_in_colour_is_designed(here, capfd):
     """By light of three wavelengths that the glass spreads: all have the picture's shape."""
     with Image.open("blob.png") as grey:
         Image.merge("RGB", [grey.convert("L")] * 3).save("rgb.png")
-    figures = run(capfd, "design", "rgb.png", "--color", "--glass", "N-BK7", *TINY, "--iterations", "3", "-o", "colour")
+    figures = run(
+        capfd, "design", "rgb.png", "--color", "--glass", "N-BK7", *TINY, "--iterations", "3", "-o", "colour", "--movie", "m.gif"
+    )
+    with Image.open("m.gif") as movie:
+        assert movie.n_frames > 2
     assert figures["relative_rms"] < 0.2 and figures["ciede2000"] < 10.0
     lens = load("colour")
     seen = expose(lens.scene, lens.field, lens.heights, rays_of(lens.scene, "grid", 20_000)).image

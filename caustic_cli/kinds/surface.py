@@ -54,6 +54,7 @@ from caustic_cli.optics.image import Image
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.spread import Spread
+from caustic_cli.optics.spreads import Spreads
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
@@ -389,7 +390,7 @@ class OneSurface(Problem):
         spread = source_spread(scene, self.field(k), initial)
         return None if spread is None else self.blurred(scene, k, spread)
 
-    def blurred(self, scene: Scene, k: int, spread: Spread) -> Objective:
+    def blurred(self, scene: Scene, k: int, spread: Spread | Spreads) -> Objective:
         """The objective of stage k on the image of the source's centre, convolved with this point-spread function."""
         stage, o, field = self.stages[k], self.options, self.field(k)
         expected = best_irradiance(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept

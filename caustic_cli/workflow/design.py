@@ -295,7 +295,7 @@ def _run_index(
 
             def on_iteration(now: State) -> None:
                 _, _, loss, on_screen, _ = now.history[-1]
-                show("index", f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", now.total, total)
+                show("index", f"loss {loss * grey(target).size:.4f}  on screen {on_screen:.1%}", now.total, total)
                 movie.record(now, target, project.settings.target.encoding, False)
 
             with ranks.together(partial(_joined_index, project.settings, project.picture, _on_cpu(state), total, problem.device)):

@@ -204,7 +204,7 @@ class SplineIndex(IndexField):
 
     def at(self, point: Point, coefficients: Tensor | None = None):
         """See the module; the reference for `kernels.spline_index`."""
-        c = self.coefficients if coefficients is None else coefficients
+        c = (self.coefficients if coefficients is None else coefficients).to(point[0].device)
         parts = [self._basis(k, q) for k, q in enumerate(point)]
         flat, (_, m, depth) = c.reshape(-1), self.coefficients.shape
         (i, bu, du), (j, bv, dv), (k, bw, dw) = parts
