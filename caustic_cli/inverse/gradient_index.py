@@ -38,7 +38,7 @@ INDEX_DESIGN = Capability(
     {"mirror": "no light enters it"},
 )
 #: Places along each axis where the inclination of the light is measured, and most layers that follow it.
-PLACES, MOST_LAYERS = 9, 16
+PLACES, MOST_LAYERS = 9, 8
 #: Fixed-point iterations of the initial sines.
 SINES = 3
 #: Relative margin of the initial index to the ends of its range.

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config.default_stages import Table, transport_cells
+from caustic_cli.config.default_stages import MOST_CELLS, Table
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, State
@@ -43,9 +43,10 @@ from caustic_cli.schema.table import LensSettings, ScreenSettings, check, check_
 
 manufacture = OnDemand("caustic_cli.studies.manufacture")
 
-#: Half range about the index; degree of its splines, knot spans per pixel and their largest number.
-HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS = 0.05, 3, 2, 768
-RAYS_BENT, ITERATIONS = 16, 24  # largest number of rays per pixel, since they cost more; and iterations
+#: Half range about the index; degree of its splines, knot spans per pixel, those for pictures with creases, and their largest
+#: number; source cells of the transport per span.
+HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, CREASED_SPANS, MOST_SPANS, CELLS_A_SPAN = 0.05, 3, 2, 8, 768, 2
+RAYS_BENT, ITERATIONS = 16, 24  # largest number of rays per pixel, since they cost more; and iterations where there are no creases
 
 
 class IndexPlate(AmongElements):
@@ -75,11 +76,8 @@ class IndexPlate(AmongElements):
     @classmethod
     def blank(cls, lens: LensSettings, screen: ScreenSettings, index: float) -> LensSettings:
         """The lens with the range and the control values of its index."""
-        lens = cls.sides(lens).filled(
-            index_range=(max(1.0, index - HALF_RANGE), index + HALF_RANGE),
-            index_control=[min(MOST_SPANS, INDEX_SPANS * n) + INDEX_DEGREE for n in screen.resolution],
-        )
-        check_all("lens", lens, "index_range", "index_control", "index_layers")
+        lens = cls.sides(lens).filled(index_range=(max(1.0, index - HALF_RANGE), index + HALF_RANGE))
+        check_all("lens", lens, "index_range", "index_layers")
         if not lens.index_range[0] < lens.index_range[1]:
             raise InputError(f"⟨lens.index_range⟩ must ascend, got {list(lens.index_range)}")
         return super().blank(lens, screen, index)
@@ -99,8 +97,12 @@ class IndexPlate(AmongElements):
         check("design.waves", design.waves)
         if design.get("start", "transport") not in cls.starts:
             raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design.start}")
-        if "index_layers" not in d.lens:
-            d.s = d.s.changed(lens=d.lens.changed(index_layers=layers_along(d.scene, d.lens.index_control)))
+        spans = CREASED_SPANS if cls.has_creases(d) else INDEX_SPANS
+        lens = d.lens.filled(index_control=[min(MOST_SPANS, spans * n) + INDEX_DEGREE for n in d.resolution])
+        check("lens.index_control", lens.index_control)
+        if "index_layers" not in lens:
+            lens = lens.changed(index_layers=layers_along(d.scene, lens.index_control))
+        d.s = d.s.changed(lens=lens)
         cls.complete_surface(d)
         if "stages" not in design:
             stage = cls.default_stage(d)
@@ -122,7 +124,8 @@ class IndexPlate(AmongElements):
     @classmethod
     def default_stage(cls, d: Defaults) -> Table:
         """The stage unless it is given, before its rays are limited."""
-        return cls.refinement(d)[-1] | {"iterations": ITERATIONS}
+        stage = cls.refinement(d)[-1]
+        return stage if cls.has_creases(d) else stage | {"iterations": ITERATIONS}
 
     def iterate(
         self,
@@ -187,8 +190,8 @@ class IndexPlate(AmongElements):
     @cached_property
     def initial_index(self) -> Tensor:
         """Control values (n, m, layers) of the initial index."""
-        cells = transport_cells(self.stages[-1].rays, False, least=self.effort.source_cells)
         control, limits, layers = self.index
+        cells = min(MOST_CELLS, max(self.effort.source_cells, CELLS_A_SPAN * (max(control) - INDEX_DEGREE)))
         return self.start_of_index(*self.unblurred(self._blank), control, limits, cells, layers)
 
     #: What finds them, from scene, target, number along x and y and range of the control values, source cells, and layers.

@@ -410,9 +410,10 @@ class LensSettings(Section):
             derived="the index, 0.05 less to 0.05 more", why="the range of gradients in glass and printed polymers",
             option=Option("--index-range", "LEAST,MOST"))
     index_control: Wholes = setting("control values of a free gradient along x and y", low=4, high=1024,
-            derived="two knot spans per pixel", why="as for a surface", option=Option("--index-control", "N[xM]"))
+            derived="two knot spans per pixel, eight for pictures with dark gaps", why="as for a surface: finer than the"
+            " picture, and than the creases of dark gaps", option=Option("--index-control", "N[xM]"))
     index_layers: int = setting("control values of a free gradient along z; for light inclined to the axis by default as many,"
-            " at most 16, as follow it to the detail of those along x and y", low=1, high=64, default=1, written=False,
+            " at most 8, as follow it to the detail of those along x and y", low=1, high=64, default=1, written=False,
             why="in a thin blank only the integral of the index along a ray matters")
     with_surface: bool = setting("the exit of a lens with a free gradient is designed together with its index, instead of two flat"
             " sides; the index begins with half of the deflection, or as much as its range allows", default=False, written=False,
