@@ -73,8 +73,10 @@ def test_a_gradient_index_plate_is_designed_saved_and_rendered(capfd):
     assert anew["index_least"] == figures["index_least"]
     more = run(capfd, "design", "--resume", "free.caustic", "--iterations", "5", "--movie", "m.gif")
     assert more["iterations"] == 5 and more["relative_rms"] < figures["relative_rms"] + 3 * figures["noise"]
+    losses = [row[2] for row in load("free.caustic").state.history]
+    assert len(losses) == 5 and losses == sorted(losses, reverse=True)
     with Image.open("m.gif") as movie:
-        assert more["loss"] < figures["loss"] and movie.n_frames == 3
+        assert movie.n_frames == 3
     assert (
         run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] == 84 + 50 * 14
     )  # a box, of which two triangles are a side
