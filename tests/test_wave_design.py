@@ -33,6 +33,7 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.optics.waves.image import wave_image
 from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.project import completion
+from caustic_cli.project.new import new_project
 from caustic_cli.project.project import Project
 from caustic_cli.scene import (
     Component,
@@ -559,3 +560,17 @@ def _stages(path: str):
     from caustic_cli.project.project import Project  # noqa: PLC0415
 
     return Project.open(path).settings.design.stages
+
+
+@pytest.mark.parametrize("waves, spans", [("auto", 600), ("off", 1277)])
+def test_diffraction_needs_no_finer_net(tmp_path, monkeypatch, waves, spans):
+    """A draft of a picture of more than 256 pixels has a fine net for rays alone."""
+    monkeypatch.delenv("CAUSTIC_EFFORT", raising=False)
+    x, y = np.meshgrid(np.arange(250), np.arange(300))
+    np.save(tmp_path / "waves.npy", 1.5 + (np.sin(x / 9.0) * np.cos(y / 7.0)).T)
+    given = {"quality": "draft", "mag": 3.0, "design.waves": waves, "screen.resolution": [250, 300]}
+    project, _ = new_project(tmp_path / "waves.npy", given, None, None, None, lambda _: None)
+    assert max(project.settings.screen.resolution) == 300
+    assert list(project.settings.lens.control) == [spans + 3] * 2
+    assert {tuple(stage.control) for stage in project.settings.design.stages} == {(spans + 3,) * 2}
+    assert any(stage.waves for stage in project.settings.design.stages) == (waves == "auto")
