@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caustic_cli.config import settings
-from caustic_cli.config.default_stages import GAPS, transport_cells
+from caustic_cli.config.default_stages import GAPS, creased_control, transport_cells
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, Settings, build_lens, build_scene, dump, parse, tables_of
-from caustic_cli.effort import FINE, SINGLE_SPANS, STANDARD, TEST, current_effort
+from caustic_cli.effort import DRAFT, FINE, SINGLE_SPANS, STANDARD, TEST, current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.project.completion import complete
-from caustic_cli.schema.table import Parameters
+from caustic_cli.schema.table import TABLE, Parameters
 
 INDEX = 1.5443  # table D.2
 
@@ -344,3 +344,14 @@ def test_cells_of_the_start_follow_rays_or_a_fine_net():
 def test_after_a_transport_start_heights_are_refined_without_a_preconditioner():
     exact, coarse = (complete({"design": {"start": start}}, 1.0).design for start in ("transport", "offset"))
     assert (exact.preconditioner, coarse.preconditioner) == ("none", "laplacian")
+
+
+@pytest.mark.parametrize("effort", [DRAFT, STANDARD, FINE])
+@pytest.mark.parametrize("pieces", [1, 5, 12])
+def test_the_finest_default_net_is_one_that_may_be_asked_for(effort, pieces):
+    for pixels in (64, 250, 257, 300, 1000, 3000):
+        for degree in (1, 3, 5):
+            points = creased_control(pixels, degree, effort.creased, pieces)
+            spans = (points - 1) // pieces - degree + 1
+            assert points <= TABLE["lens.control"].high and points == pieces * (spans + degree - 1) + 1
+            assert spans >= min(0.97 * effort.creased.spans(pixels) / pieces, 64)

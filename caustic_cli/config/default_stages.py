@@ -15,7 +15,7 @@ from caustic_cli.config.settings import Settings
 from caustic_cli.effort import STANDARD, Effort, Refinement
 from caustic_cli.inverse.initial_surface import COARSE
 from caustic_cli.scene import Source
-from caustic_cli.schema.table import default
+from caustic_cli.schema.table import TABLE, default
 
 Table = dict[str, Any]
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
@@ -138,15 +138,24 @@ def creased_control(pixels: int, degree: int, plan: Refinement, pieces: int = 1)
     """Control points along an axis for a picture with gaps, or pictures of `pieces` lenslets with so many pixels in all.
 
     The number of knot spans of a piece is a multiple of the cells of the coarse transport solution, increased where it or the
-    number of control points has a large prime factor: the cosine transforms of the initial surface and of the preconditioner are
-    three times as slow for such lengths.
+    number of control points has a large prime factor, or else decreased: the cosine transforms of the initial surface and of the
+    preconditioner are three times as slow for such lengths.
     """
     spans = -(-plan.spans(pixels) // pieces)
     step = -(-spans // COARSE)
     spans = -(-spans // step) * step
-    while max(map(_largest_factor, (spans, pieces * (spans + degree - 1) + 1))) > LARGEST_FACTOR:
+
+    def points(spans: int) -> int:
+        return pieces * (spans + degree - 1) + 1
+
+    def slow(spans: int) -> bool:
+        return max(map(_largest_factor, (spans, points(spans)))) > LARGEST_FACTOR
+
+    while slow(spans):
         spans += step
-    return pieces * (spans + degree - 1) + 1
+    while points(spans) > TABLE["lens.control"].high or slow(spans):
+        spans -= step
+    return points(spans)
 
 
 def _largest_factor(n: int) -> int:
