@@ -248,7 +248,7 @@ class OneSurface(Problem):
     @classmethod
     def smoothed(cls, d: Defaults, waves: list[Table]) -> list[Table]:
         """Stages on the wave image; the default control net is no finer for them than diffraction lets it be."""
-        if not (waves and cls.exact_start(d)) or d.own_control or cls.pieces(d) != (1, 1):
+        if not (waves and cls.exact_start(d)) or d.own_control or max(d.lens.array) > 1:
             return waves
         most = max(d.effort.refinement.least_spans, LIGHT_SPANS * max(d.resolution))
         d.set_control([min(n, most + p) for n, p in zip(d.lens.control, d.lens.degree, strict=True)])
