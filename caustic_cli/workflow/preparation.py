@@ -211,8 +211,8 @@ def _spare(lens: LensSettings, said: Given, first: torch.Tensor) -> float:
 
 
 def _room(given: LensSettings, said: Given, first: torch.Tensor) -> dict[str, Any]:
-    """Height range and thickness as the initial surface requires, where it needs others and the user fixed none; of limits that he
-    gave, what is left of it between them."""
+    """Height range and thickness as the initial surface requires, where it needs others and the user fixed none; of a surface that
+    given limits cut off, as what is left of it requires."""
     lens, fixed = build_lens(given), said.get("lens", {})
     offset = HeightField.of(replace(lens, control=tuple(first.shape)))
     x, y = (c.numpy() for c in offset.control_xy())

@@ -111,8 +111,8 @@ def rows_of_part(f: dict[str, Any]) -> list[tuple[str, str]]:
             0,
             (
                 "uncertain",
-                f"only {part['explained']:.2%} is explained, of which the part's own deviation explains {FOUND:.2%}: where light is"
-                " folded finely, the fit ends on another surface, which is off by more than said",
+                f"{part['explained']:.2%} of the photograph's variance is explained, less than the {FOUND:.2%} that the part's own"
+                " deviation explains: where light is folded finely, the fit ends on another surface, off by more than is said",
             ),
         )
     found += [("not told apart", words) for words in part["not_told_apart"]]
