@@ -166,6 +166,7 @@ DRAFT = Effort(
     pairs=Refinement(1.0, 256, 8, 500_000, 2, ((1.0, 75),), large=LargePictures(256, 384)),
     waves=((2, 12),),
     wave_seconds=8.0,
+    cost_points=5,
 )
 STANDARD = Effort(
     seconds=8.0,

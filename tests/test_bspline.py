@@ -8,10 +8,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from parametric import Surface
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, RectBivariateSpline
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace, over_grid
+from caustic_cli.optics.bspline import MAX_DEGREE, GridSpline, SplineSpace, over_grid
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens
@@ -322,6 +322,21 @@ def test_equal_weights_are_no_weights():
     u, v = torch.rand(2, 100, dtype=torch.float64)
     for orders in ((0, 0), (1, 0), (1, 1)):
         torch.testing.assert_close(rational.evaluate(u, v, *orders), plain.evaluate(u, v, *orders), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (4, 9), (17, 30)])
+def test_the_spline_through_a_grid_is_that_of_scipy(shape):
+    rng = np.random.default_rng(3)
+    lines = [np.sort(rng.uniform(-4.0, 3.0, n)) + np.arange(n) for n in shape]
+    values = rng.normal(size=shape)
+    ours = GridSpline(*lines, values)
+    theirs = RectBivariateSpline(*lines, values, kx=min(3, shape[0] - 1), ky=min(3, shape[1] - 1), s=0)
+    at = [np.linspace(c[0] - 1.0, c[-1] + 1.0, n) for c, n in zip(lines, (40, 23), strict=True)]  # held beyond the ends
+    assert np.abs(ours(*lines) - values).max() <= 1e-12
+    assert np.abs(ours(*at) - theirs(*at)).max() <= 1e-11
+    for found, (dx, dy) in zip(ours.derivatives(*at, [(1, 0), (0, 1)]), [(1, 0), (0, 1)], strict=True):
+        inside = theirs(*(np.clip(p, c[0], c[-1]) for p, c in zip(at, lines, strict=True)), dx=dx, dy=dy)
+        assert np.abs(found - inside).max() <= 1e-10
 
 
 BAD_KNOTS = {

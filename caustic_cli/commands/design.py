@@ -109,7 +109,7 @@ def run(asked: DesignOptions) -> None:
     device = asked.start_torch()
 
     from caustic_cli.config.lamp import asks_for_lamp, says_lamp  # noqa: PLC0415
-    from caustic_cli.workflow import lamp, library  # noqa: PLC0415
+    from caustic_cli.workflow import library  # noqa: PLC0415
 
     for_lamp = says_lamp(project) if asked.resume else asks_for_lamp(asked.given, asked.preset, asked.config)
     if for_lamp:
@@ -126,7 +126,7 @@ def run(asked: DesignOptions) -> None:
         else:
             how |= {"preset": asked.preset, "config": asked.config, "out": path}
             lens = library.design_of(picture, asked.given, error=asked.error, **how)
-    say.table(lens.figures["project"], (lamp.rows if for_lamp else console.figures_rows)(lens.figures))
+    say.table(lens.figures["project"], (library.lamp.rows if for_lamp else console.figures_rows)(lens.figures))
     if asked.json:
         console.emit_json(lens.figures)
 

@@ -16,15 +16,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 from caustic_cli.export.surface import SurfaceGrid
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Aperture, FreeForm
 from caustic_cli.scene.aperture import UNBOUNDED
+
+interpolate = OnDemand("scipy.interpolate")
 
 #: Random points at which heights are compared.
 POINTS = 100_000
@@ -68,9 +70,9 @@ def spline_through(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[HeightF
         degree = min(3, len(lines) - 1)
         if degree == 2:  # three points determine one parabola; SciPy accepts odd degrees only without knots
             knots = np.repeat([lines[0], lines[-1]], 3)
-            found = make_interp_spline(lines, net, 2, t=knots)
+            found = interpolate.make_interp_spline(lines, net, 2, t=knots)
         else:
-            found = make_interp_spline(lines, net, degree)
+            found = interpolate.make_interp_spline(lines, net, degree)
         middle, reach = 0.5 * (lines[0] + lines[-1]), 0.5 * (lines[-1] - lines[0])
         knots = 0.5 * ((found.t - middle) / reach + 1.0)
         knots[: degree + 1], knots[-degree - 1 :] = 0.0, 1.0

@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import map_coordinates
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.relay import trace_through, without_apertures, without_freeforms
@@ -293,8 +293,9 @@ def _pupil_irradiance(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     edges = [np.linspace(-h, h, CELLS + 1) for h in pupil.half_size]
     light = on_entrance(replace(scene, lens=lens, elements=()), *edges)[0]
     middles = [0.5 * (e[1:] + e[:-1]) for e in edges]
-    points = np.stack([np.clip(c, m[0], m[-1]) for c, m in zip((a, b), middles, strict=True)], -1)
-    return RegularGridInterpolator(middles, light)(points)
+    return map_coordinates(
+        light, [(c - m[0]) / (m[1] - m[0]) for c, m in zip((a, b), middles, strict=True)], order=1, mode="nearest"
+    )
 
 
 def part_within(aperture: Aperture, x: np.ndarray, y: np.ndarray) -> np.ndarray | float:

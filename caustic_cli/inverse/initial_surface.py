@@ -16,7 +16,6 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from caustic_cli.effort import STANDARD
@@ -25,9 +24,10 @@ from caustic_cli.inverse.incidence import Place, incident, is_traced, lit_rectan
 from caustic_cli.inverse.projection import CrossedProjection, ScreenProjection, projection_of, seen_by_light
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scattered import Pixels
-from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
+from caustic_cli.inverse.surface_from_map import SLOPES, MappedSurface, OutOfReach, Projection, finer, refract_to_screen
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import cell_lines, cell_means, corners
+from caustic_cli.optics.bspline import GridSpline
 from caustic_cli.optics.interface import slopes_inside
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -140,7 +140,7 @@ class _Grid:
 
     def scaled(self, values: np.ndarray, onto: _Grid) -> np.ndarray:
         """Values at the corners, interpolated at those of another grid."""
-        return RectBivariateSpline(self.x, self.y, values)(onto.x, onto.y)
+        return GridSpline(self.x, self.y, values)(onto.x, onto.y)
 
     def solved(self, light: np.ndarray, directions, mean: float, potential: np.ndarray | None = None, **options) -> MappedSurface:
         """The surface of this mean height that maps the light to the picture; potential: initial one at these corners, mm^2."""
@@ -201,14 +201,13 @@ class _Grid:
         z = np.maximum(z, self.floor)
         on_lens = incident(scene, self.x, self.y, np.full_like(z, lens.z_in))[0].sum()
         light, directions = incident(scene, self.x, self.y, z)
-        surface = RectBivariateSpline(self.x, self.y, z)
+        slopes = GridSpline(self.x, self.y, z).derivatives(self.x, self.y, SLOPES)
         at = np.broadcast_arrays(self.x[:, None], self.y[None, :])
         projection = self.projection(float(z.mean()))
         u, v, part = refract_to_screen(
             *at,
             z,
-            surface(self.x, self.y, dx=1),
-            surface(self.x, self.y, dy=1),
+            *slopes,
             directions,
             lens.effective_index,
             screen.z,
@@ -400,15 +399,16 @@ def _best(grid: _Grid, middle: float, fixed: bool) -> _TruncatedSurface:
 def extended(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Surface:
     """The cubic spline through heights z (k, l) at x (k,), y (l,), mm; beyond its edges, where it is dark, the slope decays within
     BESIDE of its width: continued, a crease would become a cliff."""
-    spline = RectBivariateSpline(x, y, z)
+    spline = GridSpline(x, y, z)
 
     def heights(*places: np.ndarray) -> np.ndarray:
-        within = [np.clip(at, c[0], c[-1]) for at, c in zip(places, (x, y), strict=True)]
-        lengths = [BESIDE * (c[-1] - c[0]) for c in (x, y)]
-        beside = [n * np.tanh((at - inner) / n) for at, inner, n in zip(places, within, lengths, strict=True)]
-        found = spline(*within)
-        if any(b.any() for b in beside):
-            found = found + spline(*within, dx=1) * beside[0][:, None] + spline(*within, dy=1) * beside[1]
+        inner = [np.clip(at, c[0], c[-1]) for at, c in zip(places, (x, y), strict=True)]
+        fades = [BESIDE * (c[-1] - c[0]) for c in (x, y)]
+        beside = [n * np.tanh((at - c) / n) for at, c, n in zip(places, inner, fades, strict=True)]
+        orders = [(0, 0), (1, 0), (0, 1)] if any(b.any() for b in beside) else [(0, 0)]
+        found, *slopes = spline.derivatives(*places, orders)
+        for slope, further in zip(slopes, (beside[0][:, None], beside[1]), strict=False):
+            found = found + slope * further
         return found
 
     return heights

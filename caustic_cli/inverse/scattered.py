@@ -17,12 +17,11 @@ from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.spatial import ConvexHull, cKDTree
 
 from caustic_cli.inverse.transport import point_masses
 from caustic_cli.loading import OnDemand
 
-laguerre = OnDemand("caustic_cli.optics.kernels.laguerre")
+spatial, laguerre = OnDemand("scipy.spatial"), OnDemand("caustic_cli.optics.kernels.laguerre")
 
 #: Distance of the four corners added around all sites, in their extent; part of the source's half sizes beyond which they may be on
 #: the envelope.
@@ -62,7 +61,7 @@ class Scattered:
         if inside is not None:
             lit = inside.ravel()[begin]
             begin, slopes, phi = begin[lit], slopes[:, lit], np.where(inside, phi, np.inf)
-        nearest = cKDTree(slopes.T).query(np.column_stack([self.y1, self.y2]))[1]
+        nearest = spatial.cKDTree(slopes.T).query(np.column_stack([self.y1, self.y2]))[1]
         return laguerre.climbed(phi, self.y1, self.y2, *raster, begin[nearest])
 
 
@@ -88,7 +87,7 @@ class LowerHull:
         """Sites that share a border with each of `planes`: those of p are other[first[p] : first[p + 1]]."""
         points = np.column_stack(self.planes)
         points = (points - points.mean(0)) / np.ptp(points, axis=0)
-        hull = ConvexHull(points, qhull_options=OPTIONS)
+        hull = spatial.ConvexHull(points, qhull_options=OPTIONS)
         below = hull.simplices[hull.equations[:, 2] < 0.0]
         edges = np.concatenate([below[:, [0, 1, 2]].ravel(), below[:, [1, 2, 0]].ravel()])
         ends = np.concatenate([edges[edges.size // 2 :], edges[: edges.size // 2]])

@@ -23,14 +23,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.fft import dctn, idctn
-from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from caustic_cli.errors import InputError
@@ -39,7 +36,9 @@ from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scattered import Pixels
 from caustic_cli.inverse.transport import LEVELS, Transport, corners, solve, solve_displaced
 from caustic_cli.optics.backends.reference import Torch
+from caustic_cli.optics.bspline import GridSpline
 from caustic_cli.optics.frames import IDENTITY
+from caustic_cli.optics.strips import each_strip
 
 Projection = ScreenProjection | RelayedScreen | CrossedProjection  # of a screen that is not the plane z_screen
 #: Largest difference of the length of a direction from 1, and one that is none.
@@ -54,8 +53,8 @@ ROUGHLY = {"tolerance": 1e-2, "most": 10, "levels": LEVELS[:-1]}
 #: By what factor the point masses are fewer of which the first map with displaced ones is found, and its options.
 FEWER, FEW = 4, {"tolerance": 1e-2, "most": 30}
 REPEATS = 4  # most fixed-point iterations; each reduces the error by a factor of about angle^2 / throw
+SLOPES = (1, 0), (0, 1)  # orders of derivatives
 CONVERGED = 1e-10  # largest expected change of a height in the next iteration, mm
-ROWS = 64  # of corners processed at a time, so that intermediate arrays fit in the cache
 
 
 class OutOfReach(InputError):
@@ -211,7 +210,7 @@ def finer(
     """
     map_ = start.transport.finer(times)
     coarse, fine = ([corners(k * n, h) for n, h in zip(start.transport.solved.shape, source_half, strict=True)] for k in (1, times))
-    shift = [RectBivariateSpline(*coarse, e)(*fine) for e in start.shift] if start.shift.any() else (0.0, 0.0)
+    shift = [GridSpline(*coarse, e)(*fine) for e in start.shift] if start.shift.any() else (0.0, 0.0)
     x, y = fine[0][:, None], fine[1][None, :]
     aim = tuple(t + e + c for t, e, c in zip((map_.x, map_.y), shift, centre, strict=True))
     d, dark = _directions(directions, map_.potential.shape), np.zeros(map_.potential.shape, bool)
@@ -284,7 +283,7 @@ def heights(
     moved = 0.0
     for _ in range(REPEATS):
         ahead = towards(x, y, z) if towards else None
-        _each_strip(len(z), remainder)
+        each_strip(len(z), remainder)
         if not within[lit].all():
             raise OutOfReach(lit & ~within)
         before, z = z, main + integrate(*rest, step)
@@ -293,13 +292,6 @@ def heights(
         if moved * moved <= CONVERGED * before or moved == 0.0:  # linear convergence
             break
     return z
-
-
-def _each_strip(n: int, work: Callable[[slice], object]) -> None:
-    """Call it with slices of n rows, ROWS at a time, on torch's number of threads."""
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for _ in pool.map(work, (slice(k, min(k + ROWS, n)) for k in range(0, n, ROWS))):
-            pass
 
 
 def refracted(tx, ty, tz, d, index: float) -> np.ndarray:
@@ -324,7 +316,7 @@ def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.n
     """Least-squares integration of slopes: the surface (n, m) of mean 0 whose differences are closest to the slopes at its
     points."""
     right = np.empty_like(sx)
-    _each_strip(len(sx), lambda rows: _divergence(sx, sy, step, rows, right))
+    each_strip(len(sx), lambda rows: _divergence(sx, sy, step, rows, right))
     wave = [(2.0 / h * np.sin(0.5 * np.pi * np.arange(n) / (n - 1))) ** 2 for n, h in zip(sx.shape, step, strict=True)]
     workers = torch.get_num_threads()
     spectrum = dctn(right, type=1, workers=workers, overwrite_x=True)
@@ -356,10 +348,8 @@ def land(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Landing points (n, m), mm, of the rays d through the bicubic spline of z, NaN where totally reflected: on the plane z_screen,
     or projected by `projection`."""
-    spline = RectBivariateSpline(x[:, 0], y[0], z, kx=min(3, len(z) - 1), ky=min(3, z.shape[1] - 1))
-    return refract_to_screen(
-        x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen, projection=projection
-    )[:2]
+    slopes = GridSpline(x[:, 0], y[0], z).derivatives(x[:, 0], y[0], SLOPES)
+    return refract_to_screen(x, y, z, *slopes, d, index, z_screen, projection=projection)[:2]
 
 
 def refract_to_screen(

@@ -30,17 +30,17 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
-from scipy.interpolate import RectBivariateSpline
-from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse import multigrid
 from caustic_cli.loading import OnDemand
+from caustic_cli.optics.bspline import GridSpline
 
+spatial = OnDemand("scipy.spatial")
 #: Compiled on first use.
 kernels, laguerre = OnDemand("caustic_cli.optics.kernels"), OnDemand("caustic_cli.optics.kernels.laguerre")
 
@@ -401,11 +401,11 @@ def _lit_part(f: np.ndarray, a: float, b: float) -> tuple[np.ndarray, np.ndarray
     return even, sides
 
 
-def _hull(points: np.ndarray) -> ConvexHull | None:
+def _hull(points: np.ndarray) -> Any:
     """Convex hull of points (k, 2), None of points on a line."""
     try:
-        return ConvexHull(points)
-    except QhullError:
+        return spatial.ConvexHull(points)
+    except spatial.QhullError:
         return None
 
 
@@ -505,7 +505,7 @@ def _resampled(potential, shape: tuple[int, int], half: tuple[float, float], ras
     if v.shape != (shape[0] + 1, shape[1] + 1) or not np.isfinite(v).all():
         raise InputError(f"the start potential must be {shape[0] + 1} x {shape[1] + 1} finite values, one a corner of a cell")
     at = [corners(s, h) for s, h in zip(shape, half, strict=True)]
-    return RectBivariateSpline(*at, v, kx=min(3, shape[0]), ky=min(3, shape[1]))(*raster)
+    return GridSpline(*at, v)(*raster)
 
 
 def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, float]) -> np.ndarray:
@@ -525,7 +525,7 @@ def _merged(psi: np.ndarray, sites: _Sites, raster: list, light: _Light) -> tupl
     seen = np.zeros(len(psi), bool)
     seen[site[site >= 0]] = True
     at = np.column_stack([sites.y1, sites.y2])
-    nearest = cKDTree(at[seen]).query(at[~seen])[1]
+    nearest = spatial.cKDTree(at[seen]).query(at[~seen])[1]
     mass = sites.mass[seen] + np.bincount(nearest, sites.mass[~seen], np.count_nonzero(seen))
     return psi[seen], sites.without(seen, mass)
 

@@ -10,17 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from scipy.interpolate import make_lsq_spline
 from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import naming, open_regular, read_bytes
 from caustic_cli.io.picture import undecoded
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.schema.checks import LENGTH
 from caustic_cli.schema.table import TABLE
 
+interpolate = OnDemand("scipy.interpolate")
 #: Suffixes of the pictures; largest value of a PNG; format version of the JSON.
 SUFFIXES = (".png", ".tif", ".tiff")
 COUNTS = 65535
@@ -79,7 +80,7 @@ def fitted(z: np.ndarray, half_size: tuple[float, float], net: dict, off: float)
     for space in spaces:  # along x, then along what was y
         at = np.linspace(0.0, 1.0, len(heights))
         try:
-            heights = make_lsq_spline(at, heights, space.knots.numpy(), space.degree).c.T
+            heights = interpolate.make_lsq_spline(at, heights, space.knots.numpy(), space.degree).c.T
         except (ValueError, np.linalg.LinAlgError) as error:
             raise InputError(f"has too few heights for the net of {space.n} control points that it names") from error
     found, net_heights = HeightField(spaces, tuple(half_size)), torch.from_numpy(np.ascontiguousarray(heights))

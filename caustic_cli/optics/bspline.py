@@ -98,6 +98,15 @@ class SplineSpace:
             raise InputError(f"spline degree must be 1 to {MAX_DEGREE}, got {degree}")
         return cls(degree, open_knots(n, degree, parts))
 
+    @classmethod
+    def through(cls, points: Tensor) -> SplineSpace:
+        """The space of the interpolating spline through values at ascending points (n,) from 0 to 1: cubic, with a third derivative
+        that is continuous at the second point and the last but one (de Boor, A Practical Guide to Splines, 2001, ch. IV), or of
+        lower degree for fewer than four points."""
+        degree = min(3, len(points) - 1)
+        inner = points[2:-2] if degree == 3 else points[:0]
+        return cls(degree, torch.cat([points.new_zeros(degree + 1), inner, points.new_ones(degree + 1)]))
+
     @property
     def n(self) -> int:
         """Number of control points."""
@@ -179,14 +188,15 @@ class SplineSpace:
         at = torch.stack([rows.reshape(-1), columns.reshape(-1)])
         return torch.sparse_coo_tensor(at, values.reshape(-1), (len(x), self.n), check_invariants=False).coalesce()
 
-    def interpolated(self, values: Tensor) -> Tensor:
-        """Control points of the spline that has the values (n, ...) at the Greville abscissae: (n, ...) float64.
+    def interpolated(self, values: Tensor, points: Tensor | None = None) -> Tensor:
+        """Control points (n, ...) float64 of the spline with the values (n, ...) at the Greville abscissae, or at points (n,) of which
+        the k-th lies in the support of the k-th basis function.
 
         The matrix is banded and totally positive, so Gaussian elimination needs no pivoting (de Boor, Pinkus, SIAM J. Numer. Anal.
         14, 1977).  It works on whole rows of the values, which for many columns is much faster than LAPACK's column by column.
         """
         p, n = self.degree, self.n
-        first, basis = self.basis(self.greville)
+        first, basis = self.basis(self.greville if points is None else points)
         rows, columns = torch.arange(n)[:, None].expand_as(basis), first[:, None] + torch.arange(p + 1)
         bands = np.zeros((n, 2 * p + 1))  # row i holds columns i - p to i + p
         bands[rows, p + columns - rows] = basis
@@ -265,3 +275,33 @@ def derivatives_over_grid(u: Sequence[Tensor], net: Tensor, v: Sequence[Tensor],
     orders = list(orders)
     along = {j: (u[j] @ net).T.contiguous() for j in {j for j, _ in orders}}
     return [(v[k] @ along[j]).T for j, k in orders]
+
+
+class GridSpline:
+    """The interpolating spline through values (n, m) at ascending points x (n,), y (m,), of the degree of `SplineSpace.through`."""
+
+    def __init__(self, x: np.ndarray, y: np.ndarray, values: np.ndarray):
+        self.first, self.length = (x[0], y[0]), (x[-1] - x[0], y[-1] - y[0])
+        points = [self._within(k, c) for k, c in enumerate((x, y))]
+        self.spaces = [SplineSpace.through(p) for p in points]
+        along = self.spaces[0].interpolated(torch.from_numpy(values), points[0])
+        self.net = self.spaces[1].interpolated(along.T, points[1]).T
+
+    def _within(self, axis: int, at: np.ndarray) -> Tensor:
+        """Points as fractions of the length; those beyond the ends there."""
+        return torch.from_numpy((at - self.first[axis]) / self.length[axis]).clamp_(0.0, 1.0)
+
+    def derivatives(self, x: np.ndarray, y: np.ndarray, orders: Iterable[tuple[int, int]]) -> list[np.ndarray]:
+        """Derivatives of these orders on the grid of points x (a,), y (b,): (a, b) each; those beyond the ends have the values
+        there."""
+        orders = list(orders)
+        most = max(map(max, orders))
+        rows, columns = (
+            [space.banded(self._within(k, c), order) / self.length[k] ** order for order in range(most + 1)]
+            for k, (space, c) in enumerate(zip(self.spaces, (x, y), strict=True))
+        )
+        return [d.numpy() for d in derivatives_over_grid(rows, self.net, columns, orders)]
+
+    def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Values on the grid of points x (a,), y (b,): (a, b)."""
+        return self.derivatives(x, y, [(0, 0)])[0]

@@ -26,11 +26,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy import fft, interpolate
+from scipy import fft
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.bspline import GridSpline, SplineSpace
 from caustic_cli.optics.surfaces.base import Surface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
@@ -279,7 +279,7 @@ class Relief:
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The spline through it on grid lines x (a,), y (b,), mm: (a, b)."""
-        return interpolate.RectBivariateSpline(*self.lines, self.z, s=0)(x, y)
+        return GridSpline(*self.lines, self.z)(x, y)
 
     def on(self, field: HeightField) -> tuple[HeightField, Tensor]:
         """The spline that interpolates it at the Greville abscissae of a surface, and its control heights (n, m), mm."""

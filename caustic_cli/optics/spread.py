@@ -15,9 +15,9 @@ from functools import cached_property
 import numpy as np
 import torch
 from scipy.fft import next_fast_len
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.emission.base import Illuminated
 from caustic_cli.optics.emission.coherent import Mode, central_mode, offset, outermost_modes
 from caustic_cli.optics.surfaces import HeightField
@@ -25,6 +25,7 @@ from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene, Source
 
+spatial = OnDemand("scipy.spatial")
 #: Quantile of the deviation that `usual` is.
 MOST = 0.8
 #: Points along each axis of the pupil at which the shifts are measured.
@@ -143,7 +144,7 @@ class Spread:
         power = power / power.sum()
         if part is not None:
             places, k = np.array(part[0]), part[1]
-            mine = cKDTree(places).query(np.stack([x, y], 1))[1] == k
+            mine = spatial.cKDTree(places).query(np.stack([x, y], 1))[1] == k
             x, y, light = x[mine] - places[k, 0], y[mine] - places[k, 1], light[mine] * len(places)
         x, y = self._sheared(half[0] * x, half[1] * y, cell)
         dx, dy = self._sheared(dx, dy, cell)

@@ -12,9 +12,12 @@ from __future__ import annotations
 
 import math
 import zlib
+from functools import partial
 
 import numpy as np
 from torch import Tensor
+
+from caustic_cli.optics.strips import each_strip
 
 #: Quantum of heights, mm; a power of two, so that its multiples are exact in float64.
 STEP = 2.0**-28
@@ -41,23 +44,33 @@ def expected_bytes(count: int) -> float:
 def pack(net: np.ndarray, like: np.ndarray | None = None) -> bytes | None:
     """Compress a large net (..., n, m) float64, mm, of multiples of STEP, as its difference to `like` if given; None for any other
     net."""
-    if net.size < LARGE or not all(_whole(z) for z in (net, like) if z is not None):
+    if net.size < LARGE:
         return None
-    values = (net / STEP).astype(np.int64)
-    if like is not None:
-        values -= (like / STEP).astype(np.int64)
-    for axis in (-1, -2):
-        values = np.diff(values, axis=axis, prepend=0)
-    values = (values << 1) ^ (values >> SIGN)
-    # In byte planes, so that similar bytes are adjacent; run-length matching alone is six times as fast as the default strategy.
-    planes = np.ascontiguousarray(values.astype("<i8").reshape(-1, 1).view(np.uint8).T)
-    packer = zlib.compressobj(strategy=zlib.Z_RLE)
+    planes = np.empty((8, net.size), np.uint8)  # so that similar bytes are adjacent
+    if not all(each_strip(net.size // net.shape[-1], partial(_coded, planes, net, like))):
+        return None
+    packer = zlib.compressobj(strategy=zlib.Z_RLE)  # run-length matching alone is six times as fast as the default strategy
     return packer.compress(planes) + packer.flush()
 
 
-def _whole(net: np.ndarray) -> bool:
-    steps = net / STEP
-    return bool((np.abs(steps) < MOST).all() and (steps == np.round(steps)).all())
+def _coded(planes: np.ndarray, net: np.ndarray, like: np.ndarray | None, rows: slice) -> bool:
+    """Code these rows of all nets (..., n, m), one below the other, in their bytes of the planes; False where they are no multiples
+    of STEP."""
+    n, m = net.shape[-2:]
+    first = max(0, rows.start - 1)  # whose differences to the row before are needed
+    values = np.zeros((rows.stop - first, m), np.int64)
+    for sign, part in ((1, net), (-1, like)):
+        if part is not None:
+            steps = part.reshape(-1, m)[first : rows.stop] / STEP
+            if not ((np.abs(steps) < MOST).all() and (steps == np.round(steps)).all()):
+                return False
+            values += sign * steps.astype(np.int64)
+    values = np.diff(values, axis=1, prepend=0)
+    top = np.arange(first, rows.stop) % n == 0
+    values = np.where(top[:, None], values, np.diff(values, axis=0, prepend=0))[rows.start - first :]
+    values = (values << 1) ^ (values >> SIGN)
+    planes[:, rows.start * m : rows.stop * m] = values.astype("<i8").reshape(-1, 1).view(np.uint8).T
+    return True
 
 
 def unpack(data: bytes, shape: tuple[int, ...], like: np.ndarray | None = None, complement: bool = False) -> np.ndarray:

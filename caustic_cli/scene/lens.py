@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from caustic_cli.scene.cells import Cells
 
 packings = OnDemand("caustic_cli.scene.packing")
+#: Rows of a grid that are computed at a time, so that intermediate arrays fit in the cache.
+ROWS = 64
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,11 @@ class Offset:
 
     def heights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """f on the grid of points x (n,), y (m,): (n, m) float64 mm; raises as `sag`."""
-        return self.thickness + self.sag(x[:, None], y[None, :])
+        self.sag(np.array([x.min(), x.max()])[:, None], np.array([y.min(), y.max()]))  # refuses all at once
+        f = np.empty((len(x), len(y)))
+        for k in range(0, len(x), ROWS):
+            np.add(self.thickness, self.sag(x[k : k + ROWS, None], y), out=f[k : k + ROWS])
+        return f
 
 
 def array_control(n: int, degree: int, lenslets: int) -> int:

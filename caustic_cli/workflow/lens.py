@@ -19,6 +19,7 @@ from caustic_cli.effort import current_effort
 from caustic_cli.errors import InputError
 from caustic_cli.export import format_of
 from caustic_cli.inverse.designer import State
+from caustic_cli.loading import OnDemand
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.plan import Plan, compile_plan, parse_effects
 from caustic_cli.optics.reconstruction import Filter
@@ -37,9 +38,10 @@ from caustic_cli.studies.retrace import evaluation_rays, retrace
 from caustic_cli.studies.viewing import tristimulus_values
 from caustic_cli.studies.waves import height_deviation, wave_figures
 from caustic_cli.workflow.compilation import compile_for
-from caustic_cli.workflow.export import Exporter
 from caustic_cli.workflow.machining import FINER
 from caustic_cli.workflow.reporter import Listener, Reporter
+
+exporting = OnDemand("caustic_cli.workflow.export")
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +257,7 @@ class Lens:
         name = format_of(path, format)
         each = (("samples", samples), ("tolerance", tolerance), ("levels", levels))
         given: dict[str, Any] = {key: value for key, value in each if value is not None}
-        exporter = Exporter(self.scene, *self.made, self.target, self.by_waves, self.seed)
+        exporter = exporting.Exporter(self.scene, *self.made, self.target, self.by_waves, self.seed)
         exporter.write(path, name, script, mould, block, milling, **given)
         return path
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -38,14 +38,16 @@ from caustic_cli.optics.trace import tracers
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow import lamp, lens, preparation, progress
+from caustic_cli.workflow import lens, preparation, progress
 from caustic_cli.workflow.finishing import of_design
-from caustic_cli.workflow.lamp import LampDesign
 from caustic_cli.workflow.lens import Lens, Render, count
 from caustic_cli.workflow.movie import recorder
 from caustic_cli.workflow.reporter import Listener, Reporter
 
-estimate = OnDemand("caustic_cli.workflow.estimate")
+if TYPE_CHECKING:
+    from caustic_cli.workflow.lamp import LampDesign
+
+estimate, lamp = OnDemand("caustic_cli.workflow.estimate"), OnDemand("caustic_cli.workflow.lamp")
 
 #: Progress callback of a design: stage, status, iterations done, and in total.
 Progress = Callable[[str, str, int | None, int | None], None]
@@ -210,7 +212,7 @@ def load(path: str | Path, at: str | None = None, **given: Any) -> Lens | LampDe
     if says_lamp(Path(path)):
         if at is not None or given:
             raise InputError(f"{path}: is a lamp, which has no other light or screen, got {', '.join([*given] or ['at'])}")
-        return LampDesign.of(Project.open(path))
+        return lamp.LampDesign.of(Project.open(path))
     return lens.load(path, at, **given)
 
 
@@ -223,7 +225,7 @@ def _lens(done: workflow.Result, device: str, say: Reporter) -> Lens:
 
 def render(lens: Lens | LampDesign | str | Path, rays: float | None = None, **options: Any) -> Render:
     """`Lens.render` of a lens or a lamp, or of a project or an archive, with the keywords of `load`, too."""
-    if isinstance(lens, Lens | LampDesign):
+    if not isinstance(lens, str | Path):
         return lens.render(rays, **options)
     own = {name: options.pop(name) for name in signature(Lens.render).parameters if name in options}
     return load(lens, **options).render(rays, **own)

@@ -17,7 +17,6 @@ from typing import cast
 
 import numpy as np
 import torch
-from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from caustic_cli.optics.backends import backend_for
@@ -47,10 +46,9 @@ class HeightField(Surface[Tensor]):
     def through(cls, z: np.ndarray, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
         """The interpolating spline of heights (a, b) mm on a uniform grid over the aperture, borders included, and its control
         heights: cubic, or of lower degree for fewer points."""
-        degrees = [min(3, n - 1) for n in z.shape]
-        spline = RectBivariateSpline(*(np.linspace(0.0, 1.0, n) for n in z.shape), z, kx=degrees[0], ky=degrees[1], s=0)
-        u, v = (SplineSpace(p, torch.from_numpy(t)) for p, t in zip(degrees, spline.get_knots(), strict=True))
-        return cls((u, v), half_size), torch.from_numpy(spline.get_coeffs().reshape(z.shape))
+        points = [torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in z.shape]
+        u, v = (SplineSpace.through(c) for c in points)
+        return cls((u, v), half_size), v.interpolated(u.interpolated(torch.from_numpy(z), points[0]).T, points[1]).T.contiguous()
 
     @property
     def shape(self) -> tuple[int, int]:
