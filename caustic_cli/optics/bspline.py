@@ -189,8 +189,8 @@ class SplineSpace:
         return torch.sparse_coo_tensor(at, values.reshape(-1), (len(x), self.n), check_invariants=False).coalesce()
 
     def interpolated(self, values: Tensor, points: Tensor | None = None) -> Tensor:
-        """Control points (n, ...) float64 of the spline with the values (n, ...) at the Greville abscissae, or at points (n,) of which
-        the k-th lies in the support of the k-th basis function.
+        """Control points (n, ...) float64 of the spline with the values (n, ...) at the Greville abscissae, or at points (n,) that
+        lie in the supports of the basis functions one by one.
 
         The matrix is banded and totally positive, so Gaussian elimination needs no pivoting (de Boor, Pinkus, SIAM J. Numer. Anal.
         14, 1977).  It works on whole rows of the values, which for many columns is much faster than LAPACK's column by column.

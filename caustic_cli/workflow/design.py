@@ -242,6 +242,8 @@ def _run(
     with announce_compilation(say), signals_collected(project.path is not None) as asked:
         with say.progress(watch.total) as watch.show:
             records.keep(state)
+            if aim is not None and not designer.stages[-1].waves:  # before an objective that may not be needed
+                watch.measure(state)
             with ranks.together(partial(_joined, project.settings, project.picture, _on_cpu(state), limit, problem.device)):
                 state = designer.run(
                     state,
