@@ -308,7 +308,7 @@ def test_an_interruption_before_the_first_checkpoint_says_what_is_kept(capfd, mo
     assert said == "caustic: interrupted; before the first checkpoint: nothing was written to blob.caustic\n"
     assert not Path("blob.caustic").exists()
     with monkeypatch.context() as patch:
-        patch.setattr(progress.Records, "keep", interrupt)
+        patch.setattr(progress.Records, "keep_behind", interrupt)
         said = run([*DESIGN, "--quiet"], capfd, 130).err
     assert "blob.caustic holds the settings and the picture" in said and "design --resume blob.caustic" in said
     assert json.loads(run(["design", "--resume", "blob.caustic", "--json", "--quiet"], capfd).out)["iterations"] == 3

@@ -28,6 +28,7 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -84,13 +85,24 @@ class Checkpoint:
     inputs: dict = field(default_factory=dict)
 
 
-def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint atomically.
+def packed(state: State) -> dict[str, bytes | None]:
+    """The nets of a state as they are stored, by name; None for those that are not compressed."""
+    heights = state.heights.cpu().numpy()
+    found = {HEIGHTS: pack(heights)}
+    for name in STARTS:
+        if (net := getattr(state, name)) is not None:
+            found[name] = pack(net.cpu().numpy(), heights if net.shape == state.heights.shape else None)
+    return found
+
+
+def save(path: Path, checkpoint: Checkpoint, nets: Mapping[str, bytes | None] | None = None) -> None:
+    """Write a checkpoint atomically; nets: of its state, as of `packed`, if they have been compressed already.
 
     Raises:
         CausticError: it could not be written; the one before is intact.
     """
     state, spaces = checkpoint.state, checkpoint.spaces
+    nets = packed(state) if nets is None else nets
     image = io.BytesIO()  # in memory, so that a full disk is not an error inside HDF5
     with h5py.File(image, "w") as f:
         f.attrs["format_version"] = PLAIN
@@ -98,13 +110,12 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         f.attrs["provenance"] = json.dumps(checkpoint.provenance, sort_keys=True)
         f.attrs["results"] = json.dumps(checkpoint.results)
         f.attrs["inputs"] = json.dumps(checkpoint.inputs, sort_keys=True)
-        heights = state.heights.cpu().numpy()
-        _write_net(f, HEIGHTS, heights)
+        _write_net(f, HEIGHTS, state.heights, nets[HEIGHTS])
         f["lens"].attrs["degree"] = [s.degree for s in spaces]
         f["lens/knots_u"], f["lens/knots_v"] = (s.knots.numpy() for s in spaces)
         for name in STARTS:
             if (net := getattr(state, name)) is not None:
-                _write_net(f, name, net.cpu().numpy(), heights)
+                _write_net(f, name, net, nets[name])
         group = f.create_group("state")
         for name in ("stage", "iteration", "total", "seconds", "reason"):
             group.attrs[name] = getattr(state, name)
@@ -119,12 +130,11 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     write_bytes(path, seal(image.getbuffer()), image.getbuffer())
 
 
-def _write_net(f: h5py.File, name: str, net: np.ndarray, beside: np.ndarray | None = None) -> None:
-    like = beside if beside is not None and beside.shape == net.shape else None
-    if (packed := pack(net, like)) is None:
-        f[name] = net
+def _write_net(f: h5py.File, name: str, net: torch.Tensor, coded: bytes | None) -> None:
+    if coded is None:
+        f[name] = net.cpu().numpy()
         return
-    f[name] = np.frombuffer(packed, np.uint8)
+    f[name] = np.frombuffer(coded, np.uint8)
     f[name].attrs["shape"] = net.shape
     f.attrs["format_version"] = FORMAT_VERSION
 

@@ -229,9 +229,9 @@ class Project:
         """Read the checkpoint."""
         return checkpoint.load(self.path / CHECKPOINT)
 
-    def save(self, state: Checkpoint) -> None:
-        """Write a checkpoint."""
-        checkpoint.save(self.path / CHECKPOINT, state)
+    def save(self, state: Checkpoint, nets: Mapping[str, bytes | None] | None = None) -> None:
+        """Write a checkpoint; nets: as of `checkpoint.save`."""
+        checkpoint.save(self.path / CHECKPOINT, state, nets)
 
     def lens(self, scene: Scene) -> Designed:
         """The designed surface, and the scene with the designed entrance, if that is free-form.

@@ -239,9 +239,9 @@ def _run(
     watch = Watch(project, designer, records, say, movie, began, state)
     movie.begin(problem.scene)
     prepare_report(project, designer)
-    with announce_compilation(say), signals_collected(project.path is not None) as asked:
+    with announce_compilation(say), signals_collected(project.path is not None) as asked, records:
         with say.progress(watch.total) as watch.show:
-            records.keep(state)
+            records.keep_behind(state)
             if aim is not None and not designer.stages[-1].waves:  # before an objective that may not be needed
                 watch.measure(state)
             with ranks.together(partial(_joined, project.settings, project.picture, _on_cpu(state), limit, problem.device)):
@@ -263,13 +263,11 @@ def _run(
             if asked:
                 records.keep(state)
                 movie.write()
-                raise Interrupted(
-                    f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
-                    f" caustic design ⟨resume⟩ {project.path} continues it",
-                    128 + asked[0],
-                )
+                saved = f"{project.path / CHECKPOINT} is saved, caustic design ⟨resume⟩ {project.path} continues it"
+                raise Interrupted(f"interrupted after {state.total} iterations; {saved}", 128 + asked[0])
             watch.keep_if_due(state)
             state.heights = rounded(designer.within_limits(state))
+            records.prepare(state)
             watch.measure(state, always=True)
         with say.waiting("evaluation with independent rays", evaluation_seconds(designer, state)):
             evaluated = evaluate_and_write(project, designer, state, timed)

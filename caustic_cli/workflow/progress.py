@@ -8,7 +8,9 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,7 +22,7 @@ from caustic_cli.errors import CausticError
 from caustic_cli.inverse.accuracy_cost import Aim, CostOfAccuracy, Start, seconds_to
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.target import grey
-from caustic_cli.project import uptodate
+from caustic_cli.project import checkpoint, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, Project
 from caustic_cli.workflow.movie import NoMovie
@@ -93,6 +95,7 @@ class Watch:
         self.show(name, f"loss {loss * grey(self.target).size:.4f}  on screen {on_screen:.1%}", now.total, self.total)
         self.movie.record(now, self.target, self.encoding, bool(stage.waves))
         self.measure_if_due(now, begins)
+        self.records.settle(wait=False)
         self.keep_if_due(now)
 
     def measure_if_due(self, now: State, begins: bool = False) -> None:
@@ -107,11 +110,11 @@ class Watch:
         if time.monotonic() - self.saved >= max(self.chosen.checkpoint_every, RARELY * (self.records.seconds - QUICK)):
             self.measure(now)
             self.saved = time.monotonic()  # before writing, which takes time itself
-            self.records.keep(now)
+            self.records.keep_behind(now)
 
 
 class Records:
-    """Writes the checkpoints of a design, if it has a directory."""
+    """Writes the checkpoints of a design, if it has a directory; as a context, waits at its end for what is written behind."""
 
     def __init__(self, project: Project, designer: Designer):
         self.project, self.designer, self.inputs = project, designer, uptodate.inputs(project)
@@ -120,18 +123,58 @@ class Records:
         self._before = project.path is not None and (project.path / CHECKPOINT).exists()
         self._safe = f"the one before is intact, {self._resumes}" if self._before else "nothing of it is on disk"
         self.seconds = 0.0  # that the last checkpoint took
+        self._behind = ThreadPoolExecutor(1)
+        self._writing: Future[None] | None = None
+        self._packed: tuple[list[torch.Tensor | None], Future[dict[str, bytes | None]]] | None = None
+
+    def __enter__(self) -> Records:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._behind.shutdown()
+        if kind is None:
+            self.settle()
 
     def keep(self, now: State, figures: dict[str, Any] | None = None) -> None:
         """Write a checkpoint, with the figures of a finished design.
 
         Raises:
-            CausticError: it could not be written; says which checkpoint is intact.
+            CausticError: it, or one before, could not be written; says which checkpoint is intact.
         """
+        self.settle()
+        self._write(now, figures or {})
+
+    def keep_behind(self, now: State) -> None:
+        """Write a checkpoint while the design goes on; raises as `keep`, of one before."""
+        self.settle()
+        copy = replace(now, history=[*now.history], accuracy=[*now.accuracy])
+        self._writing = self._behind.submit(self._write, copy, {})
+
+    def settle(self, wait: bool = True) -> None:
+        """Raise the error of a checkpoint that is written behind; wait: until it is written."""
+        if self._writing is not None and (wait or self._writing.done()):
+            writing, self._writing = self._writing, None
+            writing.result()
+
+    def prepare(self, now: State) -> None:
+        """Compress the nets of a state that is going to be kept, while it is evaluated."""
+        if self.project.path is not None:
+            self._packed = _nets_of(now), self._behind.submit(checkpoint.packed, replace(now))
+
+    def _nets(self, now: State) -> dict[str, bytes | None] | None:
+        """The nets of a state, if they have been prepared."""
+        if self._packed is None:
+            return None
+        nets, packed = self._packed
+        return packed.result() if all(a is b for a, b in zip(nets, _nets_of(now), strict=True)) else None
+
+    def _write(self, now: State, figures: dict[str, Any]) -> None:
         if self.project.path is None:
             return
         began = time.monotonic()
+        spaces = self.designer.field(now.stage).spaces
         try:
-            self.project.save(Checkpoint(now, self.designer.field(now.stage).spaces, self.provenance, figures or {}, self.inputs))
+            self.project.save(Checkpoint(now, spaces, self.provenance, figures, self.inputs), self._nets(now))
         except CausticError as error:
             raise CausticError(f"{error} after iteration {now.total}; {self._safe}") from error
         if not self._before:  # the first checkpoint
@@ -139,6 +182,10 @@ class Records:
             self._before = True
         self._safe = f"the one of iteration {now.total} is intact, {self._resumes}"
         self.seconds = time.monotonic() - began
+
+
+def _nets_of(state: State) -> list[torch.Tensor | None]:
+    return [state.heights, *(getattr(state, name) for name in checkpoint.STARTS)]
 
 
 def provenance(project: Project, device: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,10 @@ from helpers import write_blob
 from caustic_cli import cli, load
 from caustic_cli.errors import CausticError
 from caustic_cli.export import FORMATS
-from caustic_cli.project import directory
+from caustic_cli.inverse.designer import Designer
+from caustic_cli.kinds import problem_of
+from caustic_cli.project import directory, packing
+from caustic_cli.project.project import Project
 from caustic_cli.studies import report
 from caustic_cli.studies.report import Study
 from caustic_cli.workflow import design as workflow
@@ -46,6 +50,10 @@ class Killed(Exception):
     """In place of a kill, behind which nothing more is written either."""
 
 
+def no_room(*_):
+    raise CausticError("no room")
+
+
 def killed(*_):
     raise Killed
 
@@ -53,7 +61,8 @@ def killed(*_):
 @pytest.mark.parametrize("at", ["first stage", "first checkpoint", "index"])
 def test_a_design_killed_before_its_first_checkpoint_is_begun_anew(at, capfd, monkeypatch):
     """By the same command, as if nothing had been there; another command, or an edit, still finds a design in its way."""
-    where, name = (workflow, "_run") if at == "first stage" else (progress.Records, "keep")
+    kept = "keep" if at == "index" else "keep_behind"
+    where, name = (workflow, "_run") if at == "first stage" else (progress.Records, kept)
     options = ["--quiet", "--threads", "1", *(["--gradient", "free", "--index-control", "8"] if at == "index" else [])]
     command = [*(a for a in DESIGN if at != "index" or a not in ("--start", "offset")), *options]
     shutil.rmtree("blob.caustic")
@@ -75,6 +84,42 @@ def test_a_design_killed_before_its_first_checkpoint_is_begun_anew(at, capfd, mo
     assert torch.equal(again.heights, whole.heights) and again.figures["relative_rms"] == whole.figures["relative_rms"]
     assert cli.run([*command[: command.index("--quiet")], *command[command.index("--quiet") + 1 :]]) == 0
     assert "nothing to do" in capfd.readouterr().err
+
+
+def test_a_checkpoint_that_cannot_be_written_behind_ends_the_design(capfd, monkeypatch):
+    """The first by the next iteration at the latest, a later one with the word that the one before is intact."""
+    shutil.rmtree("blob.caustic")
+    write_picture()
+    command = [*DESIGN, "--quiet", "--threads", "1"]
+    with monkeypatch.context() as patch:
+        patch.setattr(Project, "save", no_room)
+        assert cli.run(command) == 1
+    assert capfd.readouterr().err == "caustic: no room after iteration 0; nothing of it is on disk\n"
+    assert not Path("blob.caustic/checkpoints.h5").exists()
+    assert cli.run(command) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(Project, "save", no_room)
+        patch.setattr(progress.Watch, "keep_if_due", lambda watch, now: watch.records.keep_behind(now))
+        assert cli.run(["design", "--resume", "blob.caustic", "--iterations", "5", "--quiet", "--threads", "1"]) == 1
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and "no room after iteration" in said and "the one before is intact" in said
+    assert load("blob.caustic").figures["iterations"] == 1
+
+
+def test_nets_compressed_before_they_are_kept_are_those_that_are_kept(monkeypatch):
+    """Also where the lens that is kept is another than was expected."""
+    monkeypatch.setattr(packing, "LARGE", 1)
+    project = Project.open("blob.caustic")
+    designer, state = Designer(problem_of(project)), project.load().state
+    state.heights = packing.rounded(state.heights)
+    start = packing.rounded(state.start)
+    for other in (False, True):
+        with progress.Records(project, designer) as records:
+            records.prepare(state)
+            kept = replace(state, start=start) if other else state
+            records.keep(kept)
+        found = project.load().state
+        assert torch.equal(found.heights, state.heights) and torch.equal(found.start, kept.start)
 
 
 def test_a_resumed_design_remembers_its_command(capfd, monkeypatch):
