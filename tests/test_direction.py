@@ -275,7 +275,7 @@ def test_wave_image(tilt, mirror):
         ((45.0, 0.0), 0.06, True, "rectangle"),
         ((45.0, 0.0), 0.06, True, "circle"),
         ((30.0, -50.0), 0.1, True, "rectangle"),
-        ((0.0, 75.0), 0.08, True, "rectangle"),
+        ((0.0, 75.0), 0.06, True, "rectangle"),
     ],
 )
 def test_start_by_transport(tilt, most, mirror, aperture):
