@@ -12,7 +12,6 @@ from helpers import write_blob
 from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse.source_limits import point_source
 from caustic_cli.kinds import evaluation
 from caustic_cli.optics.bounds import bounds_of, check_exit_above_entrance
 from caustic_cli.optics.effects import EFFECTS
@@ -20,7 +19,7 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.resolution import Resolution
-from caustic_cli.optics.spread import Convolution, spread_at
+from caustic_cli.optics.spread import Convolution, point_source, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.project.completion import complete

@@ -20,14 +20,14 @@ from caustic_cli.errors import at_most
 from caustic_cli.inverse import source_limits
 from caustic_cli.inverse.deconvolution import Blur, _cells, deconvolved, error_bound
 from caustic_cli.inverse.objective import Objective, SourceBlur
-from caustic_cli.inverse.schedule import LossImage, Stage
+from caustic_cli.inverse.schedule import LossImage
 from caustic_cli.inverse.source_image import source_images
-from caustic_cli.inverse.source_limits import etendue_limit, performance_limits, point_source, regular_rays, source_spread
+from caustic_cli.inverse.source_limits import etendue_limit, performance_limits, source_spread
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.coherent import modes, outermost_modes, vogel_disc
 from caustic_cli.optics.emission.regular import RegularGrid
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.spread import Convolution, Spread
+from caustic_cli.optics.spread import Convolution, Spread, point_source
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
@@ -217,9 +217,7 @@ def test_a_blurred_render_is_added_up_to_pixels_whatever_it_is_cut_into():
     """Three cells a pixel, of a kernel that asks for two."""
     scene = scene_of(Disc((0.0, 0.0, -40.0), (2.2, 2.2)))
     field, heights = HeightField.of(scene.lens), heights_of(scene)
-    traced, rays, kernels = regular_rays(
-        scene, source_spread(scene, field, heights), Stage((19, 19), 40_000, "grid", LossImage(oversample=3), spread=True), 0, "cpu"
-    )
+    traced, rays, kernels = source_spread(scene, field, heights).rays(scene, "grid", 40_000, 3, 0, "cpu")
     cosine, target = Filter("cosine", (3, 3)), torch.from_numpy(disc_on(32))
     made = Objective(
         traced,
@@ -249,8 +247,7 @@ def test_the_blur_is_that_on_the_screen_behind_everything(name):
     scene = replace(scene_of(SOURCES["sun"]), **BEHIND[name])
     field, heights = HeightField.of(scene.lens), heights_of(scene)
     spread = source_spread(scene, field, heights)
-    stage = Stage((19, 19), 200_000, "grid", LossImage(oversample=4), spread=True)
-    traced, rays, (kernel,) = regular_rays(scene, spread, stage, 0, "cpu")
+    traced, rays, (kernel,) = spread.rays(scene, "grid", 200_000, 4, 0, "cpu")
     wide, cut = kernel.beside, kernel.cut
     own = scene.screen.grown((wide[0] // cut, wide[1] // cut))
     cells = replace(own, resolution=(own.resolution[0] * cut, own.resolution[1] * cut))
@@ -275,12 +272,11 @@ def test_limits_of_several_sources_hold_for_the_light_of_all():
 @pytest.mark.parametrize("exact", [10.0, 1e-5], ids=["middle", "points"])
 def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
     """On its own regular rays, spread, the loss is that of very many rays drawn from all of the source; its gradient is right."""
-    monkeypatch.setattr(source_limits, "EXACT", exact)
+    monkeypatch.setattr("caustic_cli.optics.spread.EXACT", exact)
     scene = scene_of(SOURCES[kind])
     field, heights = HeightField.of(scene.lens), heights_of(scene)
-    stage = Stage((19, 19), 200_000, "grid", LossImage(oversample=4), spread=True)
     shifts = source_spread(scene, field, heights)
-    traced, rays, kernels = regular_rays(scene, shifts, stage, 0, "cpu")
+    traced, rays, kernels = shifts.rays(scene, "grid", 200_000, 4, 0, "cpu")
     assert (len(kernels) > 1) == (exact < 1.0)
     target = torch.from_numpy(disc_on(32))
     made = Objective(

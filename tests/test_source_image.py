@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from caustic_cli.inverse.source_image import CUT, _cut, _matrices, source_images
-from caustic_cli.inverse.source_limits import etendue_limit, performance_limits, point_source
+from caustic_cli.inverse.source_limits import etendue_limit, performance_limits
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.frames import turned_about
+from caustic_cli.optics.spread import point_source
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose

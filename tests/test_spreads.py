@@ -14,10 +14,11 @@ from PIL import Image
 from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.inverse.objective import Objective, SourceBlur
-from caustic_cli.inverse.schedule import LossImage, Stage
-from caustic_cli.inverse.source_limits import best_irradiance, point_source, regular_rays, source_spread
+from caustic_cli.inverse.schedule import LossImage
+from caustic_cli.inverse.source_limits import best_irradiance, source_spread
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.spread import point_source
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.project.project import Project
@@ -64,8 +65,7 @@ def test_objective_sees_the_images_of_all_sources(kind):
     """On regular rays of their centres, each spread, the loss is that of very many rays drawn from all; its gradient is right."""
     scene = scene_of(SOURCES[kind])
     field, heights = HeightField.of(scene.lens), heights_of(scene)
-    stage = Stage((19, 19), 200_000, "grid", LossImage(oversample=4), spread=True)
-    traced, rays, kernels = regular_rays(scene, source_spread(scene, field, heights), stage, 0, "cpu")
+    traced, rays, kernels = source_spread(scene, field, heights).rays(scene, "grid", 200_000, 4, 0, "cpu")
     assert len(rays) == len(kernels) > 1
     target, how = torch.from_numpy(disc_on(32)), LossImage(Filter("cosine", (3, 3)), filter_target=False, oversample=4)
     made = Objective(traced, field, rays, target, "rms", how, dtype=torch.float64, blur=SourceBlur(kernels))
@@ -102,7 +102,6 @@ def test_each_wavelength_is_of_its_source():
     colours = ((650.0,), (1.0,)), ((450.0,), (1.0,))
     dies = Disc((0.9, 0.0, -80.0), (0.5, 0.5)), Disc((-0.9, 0.0, -80.0), (0.5, 0.5))
     lens = replace(LENS, glass="N-SF11", index=1.7847, offset=Offset(1.5, (30.0, 30.0)))
-    stage = Stage((19, 19), 100_000, "grid", LossImage(oversample=4), spread=True)
     target, how = torch.ones(32, 32, dtype=torch.float64), LossImage(Filter("cosine", (3, 3)), filter_target=False, oversample=4)
 
     def of(spectra):
@@ -111,7 +110,7 @@ def test_each_wavelength_is_of_its_source():
 
     scene, exchanged = of(colours), of(colours[::-1])
     field, heights = HeightField.of(lens), lens.offset.thickness + heights_of(scene) - LENS.offset.thickness
-    traced, rays, kernels = regular_rays(scene, source_spread(scene, field, heights), stage, 0, "cpu")
+    traced, rays, kernels = source_spread(scene, field, heights).rays(scene, "grid", 100_000, 4, 0, "cpu")
     made = Objective(traced, field, rays, target, "rms", how, dtype=torch.float64, blur=SourceBlur(kernels))(heights)
     drawn, other = (
         Objective(one, field, rays_of(one, "sobol", 1 << 18), target, "rms", how, dtype=torch.float64)(heights)

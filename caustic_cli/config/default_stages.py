@@ -186,7 +186,6 @@ def refinement(
     resolution: tuple[int, int],
     how: Refinement,
     fewer: int = 1,
-    spread: bool = False,
     least: int = 0,
 ) -> list[Table]:
     """The default stages after a transport start, which is accurate at every scale: full resolution from the beginning.
@@ -197,7 +196,6 @@ def refinement(
     Args:
         rays: of the last stage, None for the default of the quality.
         fewer: divisor of the default number of rays.
-        spread: as for a stage; light that the source spreads beyond the screen is not an error.
         least: of the rays, where `rays` does not say.
     """
     pixels, most, plan = math.prod(resolution), how.most_rays, how.plan
@@ -205,21 +203,17 @@ def refinement(
         most, plan = max(most, min(large.rays_per_pixel * pixels, large.most_rays)), large.plan or plan
     rays = rays or max(LEAST_RAYS, least, min(most, how.rays_per_pixel * pixels) // fewer)
     finer = max(1, min(how.subdivision, round(math.sqrt(rays / pixels))))
-    apron = 0 if spread else math.ceil(0.04 * max(resolution))
-    stages = []
-    for part, iterations in plan:
-        stages.append(
-            on_rays(
-                control,
-                max(1, round(part * rays)),
-                "grid",
-                apron=apron,
-                iterations=LONGER * iterations if spread else iterations,
-                oversample=finer,
-            )
-            | ({"spread": True} if spread else {})
-        )
-    return stages
+    apron = math.ceil(0.04 * max(resolution))
+    return [
+        on_rays(control, max(1, round(part * rays)), "grid", apron=apron, iterations=iterations, oversample=finer)
+        for part, iterations in plan
+    ]
+
+
+def on_spread(stages: list[Table]) -> list[Table]:
+    """Stages after a transport start on the image of the source's centre, convolved with that of the source; light that this
+    spreads beyond the screen is not an error."""
+    return [stage | {"apron": 0, "iterations": LONGER * stage["iterations"], "spread": True} for stage in stages]
 
 
 #: Largest factor of the rays where every lenslet is compared with its own picture.

@@ -85,43 +85,48 @@ def penalty_of(scene: Scene, field: HeightField, loss: str, limits: Limits, devi
     return Penalty(scene, field, terms, limits.max_slope, device, limits.min_radius)
 
 
-@dataclass(frozen=True)
-class SourceBlur:
-    """What the extent of the source does to the image of its points."""
+class Unblurred:
+    """What the extent of the source does to an image by rays of the whole source: nothing."""
 
-    #: Convolution for the image of each point, with the section of the source that it represents; empty for rays of the whole
-    #: source.  The image is then traced on a margin from which light is spread onto screen and apron.
-    spread: Sequence[Convolution] = ()
-    #: Fraction of the light that can be on screen and apron behind the blur.
-    expected: float = 1.0
-
-    @property
-    def cut(self) -> int:
-        """Subdivisions of a pixel in the images that are convolved."""
-        return self.spread[0].cut if self.spread else 1
-
-    @property
-    def beside(self) -> tuple[int, int]:
-        """Pixels of the margin along each axis."""
-        x, y = self.spread[0].beside if self.spread else (0, 0)
-        return x // self.cut, y // self.cut
+    #: Subdivisions of a pixel in the images that are convolved, and pixels of the margin along each axis.
+    cut = 1
+    beside = (0, 0)
 
     def spread_out(self, images: Tensor) -> Tensor:
         """The image on screen and apron of the whole source, from those of its points."""
-        if not self.spread:
-            return images[0]
+        return images[0]
+
+    def expected_power(self, seen: Tensor, leaving: Tensor) -> Tensor:
+        """Power to which the loss normalises an image: all that leaves the lens."""
+        return leaving
+
+
+class SourceBlur(Unblurred):
+    """What it does to the image of its points, which is traced on a margin from which light is spread onto screen and apron.
+
+    Args:
+        spread: convolution for the image of each point, with the section of the source that it represents.
+        expected: fraction of the light that can be on screen and apron behind the blur.
+    """
+
+    def __init__(self, spread: Sequence[Convolution], expected: float = 1.0):
+        self.spread, self.expected, self.cut = spread, expected, spread[0].cut
+        x, y = spread[0].beside
+        self.beside = x // self.cut, y // self.cut
+
+    def spread_out(self, images: Tensor) -> Tensor:
+        """As of rays of the whole source."""
         total: Tensor | int = 0
         for spread, image in zip(self.spread, images, strict=True):
             total = total + (torch.stack([spread(c) for c in image]) if image.ndim == 3 else spread(image))
         return cast(Tensor, total)
 
     def expected_power(self, seen: Tensor, leaving: Tensor) -> Tensor:
-        """Power to which the loss normalises an image: all that leaves the lens; with a blur that in the image, but at least what
-        can be expected there."""
-        return torch.maximum(seen.sum((-2, -1)), self.expected * leaving) if self.spread else leaving
+        """That in the image, but at least what can be expected there."""
+        return torch.maximum(seen.sum((-2, -1)), self.expected * leaving)
 
 
-UNBLURRED = SourceBlur()
+UNBLURRED = Unblurred()
 
 
 class Channel:
@@ -132,7 +137,7 @@ class Channel:
         loss: weighted terms, see `losses.parse`; how: see `LossImage`; blur: of the source.
     """
 
-    def __init__(self, screen: Screen, target: Tensor, loss: str, how: LossImage, blur: SourceBlur = UNBLURRED):
+    def __init__(self, screen: Screen, target: Tensor, loss: str, how: LossImage, blur: Unblurred = UNBLURRED):
         self.how, self.cut = how, blur.cut
         grown = screen.grown((how.apron + blur.beside[0], how.apron + blur.beside[1]))
         nx, ny = grown.resolution
@@ -194,7 +199,7 @@ class Objective:
         how: LossImage | None = None,
         limits: Limits | None = None,
         *,
-        blur: SourceBlur = UNBLURRED,
+        blur: Unblurred = UNBLURRED,
         dtype: torch.dtype = torch.float32,
     ):
         self.samplers = list(sampler) if isinstance(sampler, Sequence) else [sampler]

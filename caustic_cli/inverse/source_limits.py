@@ -21,18 +21,13 @@ from caustic_cli.errors import at_most
 from caustic_cli.inverse.deconvolution import BOUND_STEPS, BOUND_WORK, FINEST, NO_ERROR, Blur, Deconvolved, deconvolved, error_bound
 from caustic_cli.inverse.projection import stretching_surface
 from caustic_cli.inverse.relay import RelayedScreen
-from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.source_image import Sent, placed_images, source_images
-from caustic_cli.optics.emission import Rays, rays_of
-from caustic_cli.optics.emission.coherent import Mode, modes, spots
-from caustic_cli.optics.emission.regular import RegularGrid
-from caustic_cli.optics.emission.several import of_one
 from caustic_cli.optics.frames import to_global
 from caustic_cli.optics.screen_shape import normals, points_in_space
-from caustic_cli.optics.spread import POINT, Convolution, Spread
+from caustic_cli.optics.spread import Spread
 from caustic_cli.optics.spreads import Spreads, spreads_at
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.scene import Aperture, CircularAperture, PlaneWave, Points, Scene, Source
+from caustic_cli.scene import Aperture, CircularAperture, Scene
 from caustic_cli.scene.aperture import UNBOUNDED
 from caustic_cli.scene.sources.distribution import relative
 from caustic_cli.scene.traits import Capability
@@ -44,10 +39,6 @@ LIMITS = Capability(
 
 #: The blur is taken as a convolution where the deviation from it is at most this fraction of its half width.
 SHIFTS = 0.35
-#: Tolerated fraction of that deviation in a refinement, and most points that a source is sampled by to keep within it: of the same
-#: number of rays each point has a part, and the lens fits their noise instead (a mirror in the sun, fraction 0.12: 0.349 with nine
-#: points and 0.320 with one; a chip right before a lens, fraction 0.2: 0.717 with 24 and 0.694 with one).
-EXACT, MOST_MODES = 0.2, 24
 #: Points along each axis of an area.
 POINTS = 12
 #: Sets of rays from the exit to the element behind it, and rays of each; the rectangle about that element through which those that
@@ -147,47 +138,6 @@ def source_spread(scene: Scene, field: HeightField | None = None, heights: torch
     if found is None or found.usual > SHIFTS * max(found.reach()) or max(found.reach()) > max(scene.screen.size):
         return None
     return found
-
-
-def point_source(scene: Scene) -> Source:
-    """A point source at the centre of the extended one, or of several, with the same cone."""
-    source, cone = scene.source, None if scene.source.distant else math.degrees(scene.source.cone_over(scene.lens.pupil))
-    if len(source.members) > 1:
-        return PlaneWave(source.power, tilt=source.tilt) if source.distant else Points((source.centre,), (source.power,), cone=cone)
-    point = source.pointlike()
-    return point if source.distant or point.cone is not None else replace(point, cone=cone)
-
-
-def points_of(spread: Spread | Spreads) -> int:
-    """Number of points of a source, or of each of several, whose blurs represent it: one if the blur varies little over it, or has
-    no parts."""
-    if isinstance(spread, Spreads) or spread.exchanged:
-        return 1
-    each = math.ceil((spread.usual / (EXACT * max(spread.reach()))) ** 2)
-    return 1 if each <= 1 or not min(spread.half) > 0 else min(each, MOST_MODES)
-
-
-def regular_rays(
-    scene: Scene, spread: Spread | Spreads, stage: Stage, seed: int, device: str | torch.device
-) -> tuple[Scene, Rays | list[Rays], list[Convolution]]:
-    """Rays of a stage whose images are convolved with the blur: from the centre of the source or of each of several, from each of
-    separate points, or from several points of a source over which the blur varies; with the scene to trace them in and the
-    convolution for the image of each point."""
-    pixel, each, cut = scene.screen.pixel, points_of(spread), stage.rendering.oversample
-    if isinstance(spread, Spreads):
-        centres = [replace(one, source=point_source(one)) for one in scene.by_source]
-        points = replace(scene.source, members=tuple(one.source for one in centres))
-        count = max(1, stage.rays // len(centres))
-        rays = [of_one(rays_of(c, stage.sampler, count, seed + k, device), k, points) for k, c in enumerate(centres)]
-        return replace(scene, source=points), rays, spread.about_each(pixel, cut)
-    if scene.source.apart:
-        places = [Mode(scene, tuple(at), float(part)) for at, part in zip(*scene.source.points(), strict=True)]
-        return scene, RegularGrid.of_modes(places, stage.rays, device), [POINT.on(pixel, cut)] * len(places)
-    if each == 1:
-        scene = replace(scene, source=point_source(scene))
-        return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, cut)]
-    parts = spread.parts_on(pixel, spots(scene.source, each), cut)
-    return scene, RegularGrid.of_modes(modes(scene, each), stage.rays, device), parts
 
 
 def etendue_limit(scene: Scene) -> float | None:

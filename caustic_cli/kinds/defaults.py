@@ -13,7 +13,8 @@ from caustic_cli.config.design import region_of, relative_to_initial
 from caustic_cli.config.settings import Settings, build_scene
 from caustic_cli.effort import DRAFT, EFFORTS, FINE, STANDARD, Effort, current_effort
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.source_limits import point_source, points_of, source_spread
+from caustic_cli.inverse.source_limits import source_spread
+from caustic_cli.optics.spread import point_source
 from caustic_cli.optics.trace import evaluates_by_rows
 from caustic_cli.scene import Scene, Source
 from caustic_cli.schema.table import DesignSettings, LensSettings, StageSettings, check
@@ -134,17 +135,20 @@ class Defaults:
         """Whether rays of the source's centre are not intersected with the surface one by one."""
         return evaluates_by_rows(self.scene)
 
-    def fewer_rays(self, spread: bool) -> int:
-        """By what factor rays are fewer than those of a plane wave: where every one has to be intersected with the surface, and of
-        a near source, whose start takes longer the more there are; spread: those of the source's centre are traced."""
+    @property
+    def fewer_rays(self) -> int:
+        """By what factor rays are fewer than those of a plane wave: where every one has to be intersected with the surface."""
+        return 1 if self.source.collimated or self.by_rows else SCATTERED
+
+    @property
+    def fewer_blurred(self) -> int:
+        """The same where those of the source's centre are traced: also of a near source, whose start takes longer the more there
+        are."""
         scene = self.scene
-        centre = replace(scene, source=point_source(scene)) if spread else scene
+        centre, blur = replace(scene, source=point_source(scene)), source_spread(scene)
         if centre.source.collimated:
             return 1
-        blur = source_spread(scene) if spread else None
-        return (
-            SCATTERED if (blur is not None and points_of(blur) > 1) or not evaluates_by_rows(centre) else BLURRED if spread else 1
-        )
+        return BLURRED if evaluates_by_rows(centre) and (blur is None or blur.points == 1) else SCATTERED
 
     @property
     def scene(self) -> Scene:

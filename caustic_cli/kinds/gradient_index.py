@@ -31,7 +31,6 @@ from caustic_cli.inverse.graded_lens import (
 from caustic_cli.inverse.gradient_index import index_of_plate, layers_along, shared_index, with_index
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.objective import LossOfLens
-from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.elements import AmongElements
 from caustic_cli.kinds.surface import Described
@@ -224,9 +223,8 @@ class IndexPlate(AmongElements):
         """The loss in a scene whose lens has an index that varies; the blur of its source is that behind a lens of one index."""
         k = len(self.stages) - 1
         scene, stage = self.lit(scene, k), self.stages[k]
-        spread = source_spread(replace(scene, lens=replace(scene.lens, gradient=None))) if stage.spread else None
-        if spread is not None:
-            return self.blurred(scene, k, spread)
+        if (found := self.source_spread(k, replace(scene, lens=replace(scene.lens, gradient=None)))) is not None:
+            return self.blurred(scene, k, found)
         return self.on_rays(scene, k, self.field(k), self.target, stage.rays)
 
     def keep(self, found: IndexAndExit, now: State) -> None:

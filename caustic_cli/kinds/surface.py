@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
-from typing import Any, NamedTuple, Protocol, cast
-from weakref import ref
+from functools import cached_property, partial
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from caustic_cli.config.default_stages import (
     coarse_to_fine,
     creased_control,
     on_rays,
+    on_spread,
     refinement,
     transport_cells,
 )
@@ -31,9 +31,6 @@ from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.objective import LossOfHeights, Objective, SourceBlur
-from caustic_cli.inverse.optimisers import Adam, QuasiNewton
-from caustic_cli.inverse.parametrisation import FreeHeights, Heights
-from caustic_cli.inverse.problem import Problem, Skipped
 from caustic_cli.inverse.projection import BeamProjection
 from caustic_cli.inverse.reachability import refuse_unreachable
 from caustic_cli.inverse.sharpness import advice
@@ -41,28 +38,25 @@ from caustic_cli.inverse.source_limits import (
     SourceLimits,
     best_irradiance,
     performance_limits,
-    point_source,
-    regular_rays,
     source_spread,
 )
 from caustic_cli.inverse.target import grey
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.evaluation import Evaluated, LensEvaluation
+from caustic_cli.kinds.waves import OnWaves, refuse_contradiction, smoothed
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
-from caustic_cli.optics.spread import Spread
+from caustic_cli.optics.spread import Spread, point_source
 from caustic_cli.optics.spreads import Spreads
 from caustic_cli.optics.system import trace_arguments
-from caustic_cli.optics.waves.unsupported import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.schema.table import LensSettings, ScreenSettings, check, default
 from caustic_cli.studies.retrace import evaluation_rays, retrace
 
-waves, manufacture = OnDemand("caustic_cli.inverse.wave_objective"), OnDemand("caustic_cli.studies.manufacture")
-by_waves, beams = OnDemand("caustic_cli.studies.waves"), OnDemand("caustic_cli.studies.beam")
+manufacture = OnDemand("caustic_cli.studies.manufacture")
 
 #: To first order a decentre d changes the irradiance of a Gaussian beam by 4 x d / w^2, of the RMS 2 d / w over the beam.
 CENTRED = (
@@ -73,9 +67,6 @@ DEFAULT_SPANS = 128  # knot spans of the final net; divisible by 2 through the s
 #: Of one that shapes a laser beam, whose light beside the picture takes the finest structure: with 128 spans the hardest of the
 #: field's targets has 3.8 times the error.
 BEAM_SPANS = 192
-#: Knot spans per pixel of a lens for light, at most: drafts of 300 pixels, a photograph and the flame, have 0.172 and 0.175 with
-#: 600 spans, 0.179 and 0.182 with 1277, in less than half the time.
-LIGHT_SPANS = 2
 NETWORK_CONTROL = 50  # table D.2
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a thin plate, and its least wall thickness, mm
 
@@ -98,43 +89,13 @@ class Described(Protocol):
         """The second target on its screen, (k_x, k_y), or (3, k_x, k_y) in colour, or None."""
 
 
-def refuse_contradiction(asked: str, d: Defaults) -> None:
-    """Refuse given stages that contradict design.waves.
-
-    Raises:
-        InputError: they do.
-    """
-    if asked != "auto" and any(stage.waves for stage in d.design.stages) != (asked == "on"):
-        raise InputError(
-            f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
-            + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves")
-        )
-
-
-class Ahead(NamedTuple):
-    """The objective of stage k in a scene, made before its turn for these initial heights (n, m) mm."""
-
-    scene: Scene
-    k: int
-    initial: Tensor
-    objective: LossOfHeights
-
-    def of(self, scene: Scene, k: int, initial: Tensor) -> bool:
-        """Whether it is that of stage k in a scene for these heights."""
-        return scene is self.scene and k == self.k and torch.equal(initial, self.initial)
-
-
-class OneSurface(Problem):
+class OneSurface(OnWaves):
     """One free-form surface, on rays and on the wave image, under any source."""
 
     #: Whether the optimisation is that of the stage loop; otherwise the kind brings its own, `iterate`.
     in_stages = True
     #: Whether the thickness and the range of the heights may be adapted to the initial surface.
     adapts = True
-    #: The objective of a stage on the wave image, made in order to leave out stages on rays before it.
-    _ahead: Ahead | None = None
-    #: The stage on the wave image that runs, or the last that did, and its objective.
-    _refining: tuple[int, ref[LossOfHeights]] | None = None
     #: The first and the last lens that `errors` traced: heights, their version, (rays, seed), and the image.
     _traced: tuple[tuple[Tensor, int, tuple[int, int], Image], ...] = ()
 
@@ -184,7 +145,8 @@ class OneSurface(Problem):
         if d.complete_given_stages():
             refuse_contradiction(asked, d)
             return
-        waves = cls.smoothed(d, wave_stages(d.s, d.source, d.effort, d.lit))
+        waves = wave_stages(d.s, d.source, d.effort, d.lit)
+        waves = smoothed(d, waves) if cls.exact_start(d) else waves
         stages = cls.default_stages(d, waves) + waves
         if d.design.loss.strip() == "rms":  # eq. 5.2.1 is defined on the screen only
             stages = [stage | {"apron": 0} for stage in stages]
@@ -247,15 +209,6 @@ class OneSurface(Problem):
         return [spans + p for p in d.lens.degree]
 
     @classmethod
-    def smoothed(cls, d: Defaults, waves: list[Table]) -> list[Table]:
-        """Stages on the wave image; the default control net is no finer for them than diffraction lets it be."""
-        if not (waves and cls.exact_start(d)) or d.own_control or max(d.lens.array) > 1:
-            return waves
-        most = max(d.effort.refinement.least_spans, LIGHT_SPANS * max(d.resolution))
-        d.set_control([min(n, most + p) for n, p in zip(d.lens.control, d.lens.degree, strict=True)])
-        return [stage | {"control": list(d.lens.control)} for stage in waves]
-
-    @classmethod
     def default_stages(cls, d: Defaults, waves: list[Table]) -> list[Table]:
         """The stages on rays unless they are given; waves: those on the wave image that follow.
 
@@ -304,9 +257,9 @@ class OneSurface(Problem):
     @classmethod
     def refinement(cls, d: Defaults, creased: bool = False) -> list[Table]:
         """The stages after a transport start."""
-        spread = cls.spread(d)
         how = d.effort.creased if creased else d.effort.refinement
-        return refinement(d.lens.control, d.rays, d.resolution, how, d.fewer_rays(spread), spread, cls.least_rays(d))
+        stages = partial(refinement, d.lens.control, d.rays, d.resolution, how, least=cls.least_rays(d))
+        return on_spread(stages(d.fewer_blurred)) if cls.spread(d) else stages(d.fewer_rays)
 
     @classmethod
     def least_rays(cls, d: Defaults) -> int:
@@ -319,94 +272,29 @@ class OneSurface(Problem):
         super().check()
         if any(stage.lenslets and not self.takes_lenslets(k) for k, stage in enumerate(self.stages)):
             raise InputError("⟨design.stages.lenslets⟩ needs ⟨lens.array⟩, and neither waves nor spread in the same stage")
-        if not self.options.parametrisation.free and any(s.waves for s in self.stages):
-            raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
 
     def takes_lenslets(self, k: int) -> bool:
         """Whether stage k can compare each lenslet with its own target."""
         return False
 
-    def parametrised(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
-        if self.stages[k].waves:
-            return FreeHeights(*self.bounds(k), start)
-        return super().parametrised(k, start, loaded)
+    def objective_by_rays(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
+        """On the image of the source's centre, convolved with that of the source, where the stage asks for it and that is a good
+        approximation."""
+        lit = self.lit(scene, k)
+        if (found := self.source_spread(k, lit, self.field(k), initial)) is not None:
+            return self.blurred(lit, k, found)
+        return super().objective_by_rays(scene, k, initial)
 
-    def carries_parameters(self, k: int) -> bool:
-        by_rays = not (self.stages[k].waves or self.stages[k - 1].waves)
-        return super().carries_parameters(k) and (by_rays or not self.options.parametrisation.free)
-
-    def carries_curvature(self, k: int) -> bool:
-        before, stage = self.stages[k - 1 : k + 1]
-        return bool(before.waves and stage.waves) and before.control == stage.control
-
-    def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
-        return QuasiNewton if self.stages[k].waves else super().optimiser(k)
-
-    def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
-        stage = self.stages[k]
-        if stage.waves:
-            made, self._ahead = self._ahead, None
-            if made is not None and made.of(scene, k, initial):
-                refined = made.objective
-            else:
-                refined = self.on_waves(self.lit(scene, k), k, initial)
-            self._refining = k, ref(refined)
-            return refined
-        if stage.spare and self.takes_waves(scene, k, initial):
-            raise Skipped("left out, since the wave image is refined", "waves")
-        if stage.spread and (objective := self.on_spread(self.lit(scene, k), k, initial)) is not None:
-            return objective
-        return super().objective_in(scene, k, initial)
-
-    def takes_waves(self, scene: Scene, k: int, initial: Tensor) -> bool:
-        """Whether a stage after k can refine the wave image of this surface, given on the control net of stage k."""
-        later = next((j for j, stage in enumerate(self.stages) if j > k and stage.waves), None)
-        if later is None or self.stages[later].control != self.stages[k].control:
-            return False
-        if self._ahead is not None and self._ahead.of(scene, later, initial):
-            return True
-        try:
-            self._ahead = Ahead(scene, later, initial.clone(), self.on_waves(self.lit(scene, later), later, initial))
-        except Skipped:
-            return False
-        return True
-
-    def on_waves(self, scene: Scene, k: int, initial: Tensor, target: Tensor | None = None) -> LossOfHeights:
-        """The objective of stage k on the wave image; target: another than the picture's.
-
-        Raises:
-            Skipped: there is none, and it is not asked for; else NoWaveImage.
-        """
-        stage, o = self.stages[k], self.options
-        try:
-            return waves.WaveObjective(
-                scene,
-                self.field(k),
-                initial,
-                self.target if target is None else target,
-                o.loss,
-                stage.rendering,
-                o.limits,
-                wavelengths=stage.waves,
-                dtype=o.dtype,
-                device=self.device,
-            )
-        except NoWaveImage as error:
-            if o.waves:
-                raise
-            raise Skipped(f"the wave image is not refined: {error}", "no wave image") from error
-
-    def on_spread(self, scene: Scene, k: int, initial: Tensor) -> Objective | None:
-        """The objective of stage k on the image of the source's centre, convolved with that of the source; None where this is no
-        good approximation."""
-        spread = source_spread(scene, self.field(k), initial)
-        return None if spread is None else self.blurred(scene, k, spread)
+    def source_spread(self, k: int, scene: Scene, *lens: Any) -> Spread | Spreads | None:
+        """That of a scene, and a lens as of `source_limits.source_spread`, if stage k asks for it, else None."""
+        return source_spread(scene, *lens) if self.stages[k].spread else None
 
     def blurred(self, scene: Scene, k: int, spread: Spread | Spreads) -> Objective:
         """The objective of stage k on the image of the source's centre, convolved with this point-spread function."""
         stage, o, field = self.stages[k], self.options, self.field(k)
         expected = best_irradiance(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
-        scene, rays, spreads = regular_rays(scene, spread, stage, self.seed(k), self.device)
+        how = stage.sampler, stage.rays, stage.rendering.oversample
+        scene, rays, spreads = spread.rays(scene, *how, self.seed(k), self.device)
         blur = SourceBlur(spreads, expected)
         return Objective(scene, field, rays, self.target, o.loss, stage.rendering, o.limits, blur=blur, dtype=o.dtype)
 
@@ -464,10 +352,9 @@ class OneSurface(Problem):
         """A scene and the irradiance on its screen that its light is to give, where the stages convolve the image of the source's
         centre: of this centre, on a screen with room for the blur, and the irradiance from which the blur makes the picture."""
         goal = grey(self.target.numpy())
-        spread = source_spread(scene) if self.stages[0].spread else None
-        if spread is None:
+        if (found := self.source_spread(0, scene)) is None:
             return scene, goal
-        light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
+        light = best_irradiance(scene, goal, found, SMOOTH_STEPS)
         return replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:
@@ -491,9 +378,6 @@ class OneSurface(Problem):
             yield words
         if seen.matters and without_waves and self.refines_waves:
             yield f"the wave image is not refined: {without_waves}"
-
-    #: Whether the wave image can be refined at all.
-    refines_waves = True
 
     def resolution_notes(self, seen: Resolution) -> Iterator[str]:
         """What is to be said of the resolution before the design."""
@@ -581,33 +465,14 @@ class OneSurface(Problem):
         """Error of a lens by light that the optimiser does not use, as `evaluate` judges it but faster: of the wave image if that
         is refined and exists, else the quadratic mean of `errors`, without that of their noise; None if no light reaches the
         screen."""
-        used = next((stage.waves for stage in reversed(self.stages) if stage.waves), ())
-        if used and self.one_scene:
-            objective = self._refining[1]() if self._refining is not None and self._refining[0] == state.stage else None
-            if (found := self.beam_error(designer, state, objective)) is not None:
-                return found
-            approximately = {} if objective is None else {"image_at": cast(Any, objective).image_at}
-            lens = trace_arguments(self.scene, designer.field(state.stage), state.heights.to(self.device))
-            if (error := by_waves.fast_error(*lens, self.target.numpy(), used, **approximately)) is not None:
-                return error
+        if self.one_scene and (found := self.error_by_waves(designer, state)) is not None:
+            return found
         rays = max(1, int(evaluation_rays(self.scene, self.effort.final_rays) / max(1.0, self.further_retraces)))
         try:
             rows = self.errors(designer, state, rays, self.options.seed, middle=False, noise=False)
         except CausticError:
             return None
         return math.sqrt(math.fsum(row["relative_rms"] ** 2 for row in rows) / len(rows))
-
-    def beam_error(self, designer: Designer, state: State, objective: Any) -> float | None:
-        """Error in the mask of a shaped laser beam, whose other wavelengths tell nothing, by the objective if there is one; None of
-        other light."""
-        scene = self.scene
-        if (how := self.stages[-1].rendering.bright) is None or self.target.ndim > 2 or not scene.screen.upright:
-            return None
-        bright = how.on(self.target)
-        image = None if objective is None else objective.image_at(state.heights, scene.light.wavelengths)
-        if image is None:
-            image = beams.image_at(scene, designer.field(state.stage), state.heights, bright.mask.numpy())
-        return None if image is None else float(bright.error(image.cpu()))
 
     def further_figures(self, designer: Designer, state: State) -> dict[str, Any]:
         """Figures beyond those of any kind."""

@@ -27,7 +27,8 @@ from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.elements import AmongElements
 from caustic_cli.kinds.evaluation import Evaluated, radius_figures
 from caustic_cli.kinds.several_surfaces import SeveralSurfaces
-from caustic_cli.kinds.surface import Described, refuse_contradiction
+from caustic_cli.kinds.surface import Described
+from caustic_cli.kinds.waves import refuse_contradiction
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.resolution import Resolution

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.emission.coherent import offset
-from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread, alike, displacements, landing_of, spread_at
+from caustic_cli.optics.emission.several import of_one
+from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread, alike, displacements, landing_of, point_source, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Scene
@@ -45,10 +48,19 @@ class Spreads:
         mean = sum(part * kernel for part, kernel in zip(self.fractions, kernels, strict=True))
         return Convolution(torch.from_numpy(mean), cut)
 
-    def about_each(self, pixel: tuple[float, float], most: int = MOST_CUT) -> list[Convolution]:
-        """The convolution of the image of the centre of each source alone, with kernels of one shape and of sum 1."""
-        kernels, cut = self._kernels(pixel, ((0.0, 0.0),) * len(self.members), most)
-        return [Convolution(torch.from_numpy(kernel), cut) for kernel in kernels]
+    #: As of a `Spread`, of each source.
+    points = 1
+
+    def rays(
+        self, scene: Scene, sampler: str, count: int, most: int, seed: int, device: str | torch.device
+    ) -> tuple[Scene, Sequence[Rays], list[Convolution]]:
+        """As of a `Spread`: from the centre of each source, with kernels of one shape and of sum 1."""
+        centres = [replace(one, source=point_source(one)) for one in scene.by_source]
+        points = replace(cast(Any, scene.source), members=tuple(one.source for one in centres))
+        each = max(1, count // len(centres))
+        rays = [of_one(rays_of(c, sampler, each, seed + k, device), k, points) for k, c in enumerate(centres)]
+        kernels, cut = self._kernels(scene.screen.pixel, ((0.0, 0.0),) * len(self.members), most)
+        return replace(scene, source=points), rays, [Convolution(torch.from_numpy(kernel), cut) for kernel in kernels]
 
     def _kernels(
         self, pixel: tuple[float, float], shifts: Sequence[tuple[float, float]], most: int

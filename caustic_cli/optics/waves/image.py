@@ -25,7 +25,7 @@ from caustic_cli.optics.image import with_colour
 from caustic_cli.optics.interaction import Parameters
 from caustic_cli.optics.pullback import pull_back
 from caustic_cli.optics.receiver import Receiver
-from caustic_cli.optics.spread import POINT, Convolution, Spread, spread_of
+from caustic_cli.optics.spread import Convolution, Spread, in_parts
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.waves.planes import PlanesExposure, power_by_planes
@@ -61,12 +61,8 @@ A_SPAN, LEAST_NODES = 3, 384
 BESIDE = 0.5
 #: Margin of the computed region beyond the landing points of rays, in diffraction blurs.
 BLURS = 2.0
-#: Tolerance of the shift-invariance error of a point-spread function, relative to the larger of diffraction blur and pixel.
-ALLOWED = 0.25
 #: Most light of a wave image over that which leaves the lens; the sum over the samples of smooth wavefronts is within 1 % of it.
 MOST_LIGHT = 1.1
-#: Largest number of points that represent an extended source, and least number per position.
-EACH, LEAST_EACH = 24, 4
 
 #: Height perturbation of a surface: points (N,) mm -> additional height, mm.
 Perturbation = Callable[[Tensor, Tensor], Tensor]
@@ -280,20 +276,6 @@ def _alike(lines: list[Line]) -> list[list[Line]]:
     return list(groups.values())
 
 
-def _parts_of(optics: Optics, extended: bool, receiver: Receiver, blur: float) -> tuple[Spread, int]:
-    """How a source is represented: the point-spread function of a mode, and the modes per position of the source, 0 for a single
-    mode of the whole source."""
-    if not extended:
-        return POINT, 0
-    each = max(LEAST_EACH, EACH // max(1, len(optics.system.source.points()[0])))
-    spread = spread_of(optics.system, optics.landing, device_of(optics)) if receiver.across else None
-    if spread is None:
-        return POINT, each
-    parts = (spread.error / (ALLOWED * max(blur, *receiver.pixel))) ** 2
-    each = 0 if parts <= 1.0 or spread.exchanged else min(each, math.ceil(parts))
-    return (POINT if each and not max(spread.half) > 0 else spread), each
-
-
 def _region(receiver: Receiver, surveys: list[Survey], watched: tuple | None, spread: Spread, blur: float) -> tuple[tuple, tuple]:
     """Limits of the computed region on the receiver's plane, mm; watched: see `Imager.of`."""
     low, high = receiver.extent()
@@ -361,7 +343,7 @@ class Imager:
         surveys = [survey(replace(one, mode=mode)) for one in alike for mode in (one.mode, *outer)]
         lengths = tuple(k.behind for k in lines)
         blur = math.sqrt(max(lengths) * distance * surveys[0].magnification)
-        spread, each = _parts_of(alike[0], bool(outer), receiver, blur)
+        spread, each = in_parts(system, alike[0].landing, receiver.across, max(blur, *receiver.pixel), device_of(alike[0]))
         light = (
             tuple(min(s.light[0][k] for s in surveys) for k in (0, 1)),
             tuple(max(s.light[1][k] for s in surveys) for k in (0, 1)),
