@@ -13,7 +13,8 @@ from helpers import write_blob
 from rich.console import Console
 
 from caustic_cli import cli
-from caustic_cli.commands.console import ConsoleReporter, ended_words
+from caustic_cli.commands.console import ConsoleReporter
+from caustic_cli.commands.figures import ended_words
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.kinds import OneSurface
 from caustic_cli.project import checkpoint

@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.optimize import nnls
 
 from caustic_cli import cli
-from caustic_cli.commands.console import figures_rows
+from caustic_cli.commands.figures import figures_rows
 from caustic_cli.config import settings
 from caustic_cli.errors import at_most
 from caustic_cli.inverse import source_limits

@@ -10,7 +10,7 @@ import pytest
 from helpers import write_blob
 
 from caustic_cli import cli
-from caustic_cli.commands.console import figures_rows
+from caustic_cli.commands.figures import figures_rows
 from caustic_cli.commands.options import power
 from caustic_cli.config import settings
 from caustic_cli.errors import InputError

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from caustic_cli import cli, load
-from caustic_cli.commands.console import figures_rows
+from caustic_cli.commands.figures import figures_rows
 from caustic_cli.effort import EFFORTS
 from caustic_cli.errors import InputError
 from caustic_cli.io.archive import open_archive

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from caustic_cli import cli
-from caustic_cli.commands.console import figures_rows
+from caustic_cli.commands.figures import figures_rows
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.kinds import problem_of

@@ -11,7 +11,7 @@ import torch
 from helpers import write_blob
 
 from caustic_cli import cli
-from caustic_cli.commands.console import figures_rows
+from caustic_cli.commands.figures import figures_rows
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import numbers, stream
 from caustic_cli.optics.surfaces.heightfield import HeightField

@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from caustic_cli.commands import console, options
+from caustic_cli.commands import options
 from caustic_cli.commands.parser import parser
+from caustic_cli.commands.waves import rays_alone
 from caustic_cli.workflow.convergence import NETWORKS, STUDIES
 from caustic_cli.workflow.outputs import OUTPUTS, outputs_for
 from caustic_cli.workflow.outputs.base import Place, Request
@@ -63,5 +64,5 @@ def test_a_command_is_made_of_the_options_it_declares():
 
 def test_an_error_by_rays_is_excused_where_diffraction_makes_it():
     figures = {"error": 0.07, "relative_rms": 0.87, "noise": 0.002, "on_target": 0.88}
-    assert "no fault of the lens" in console._rays_alone(figures)
-    assert "no fault" not in console._rays_alone(figures | {"error": 2.47, "relative_rms": 2.48})
+    assert "no fault of the lens" in rays_alone(figures)
+    assert "no fault" not in rays_alone(figures | {"error": 2.47, "relative_rms": 2.48})

@@ -57,7 +57,7 @@ def report(tmp_path, shape=(60, 60), waves=False, stages=((0.0, False),), peak=1
     }
     figures |= {"irradiance_unit": "W/mm^2", "on_screen": 0.9, "on_target": 0.8, "lost": {"fresnel": 0.1}, "in_black": 0.02}
     if waves:
-        figures |= {"wave_relative_rms": 0.09, "start_wave_relative_rms": 0.5}
+        figures |= {"error_by": "waves", "wave_relative_rms": 0.09, "start_wave_relative_rms": 0.5}
         figures |= {f"wave_{key}_irradiance": figures[f"{key}_irradiance"] for key in ("mean", "peak")}
     losses = np.linspace(0.5, 0.05, 2 * len(stages)).reshape(-1, 2)
     history = np.array([[1, k, loss / target.size, 0.9, k + 0.1 * i] for k, row in enumerate(losses) for i, loss in enumerate(row)])

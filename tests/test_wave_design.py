@@ -15,7 +15,7 @@ from helpers import begun
 from PIL import Image
 
 from caustic_cli import cli
-from caustic_cli.commands.console import figures_rows
+from caustic_cli.commands.figures import figures_rows
 from caustic_cli.config.default_stages import LEAST_WAVES, wave_refinement
 from caustic_cli.config.design import build_options, build_stages
 from caustic_cli.config.settings import build_scene

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from caustic_cli.commands import console, options
+from caustic_cli.commands.figures import figures_rows
 from caustic_cli.errors import InputError
 from caustic_cli.schema.table import TABLE, default
 
@@ -126,7 +127,7 @@ def run(asked: DesignOptions) -> None:
         else:
             how |= {"preset": asked.preset, "config": asked.config, "out": path}
             lens = library.design_of(picture, asked.given, error=asked.error, **how)
-    say.table(lens.figures["project"], (library.lamp.rows if for_lamp else console.figures_rows)(lens.figures))
+    say.table(lens.figures["project"], (library.lamp.rows if for_lamp else figures_rows)(lens.figures))
     if asked.json:
         console.emit_json(lens.figures)
 

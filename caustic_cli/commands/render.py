@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from caustic_cli.commands import console, options
+from caustic_cli.commands.figures import figures_rows
 from caustic_cli.errors import CausticError, InputError
 
 EXAMPLES = """Examples:
@@ -243,7 +244,7 @@ def _render_lens(asked: RenderOptions, device: str, rays: int | None, size: list
     )
     outputs = outputs_for(asked)
     figures = render(Request(asked.project, tracing, outputs, asked.output, asked.at, asked.force), device, say)
-    say.table(str(asked.project), console.figures_rows(figures))
+    say.table(str(asked.project), figures_rows(figures))
     for output in outputs:
         output.show(figures, say)
     if asked.json:

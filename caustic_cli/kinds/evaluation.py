@@ -19,7 +19,7 @@ from caustic_cli.loading import OnDemand
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
-from caustic_cli.studies.metrics import judged
+from caustic_cli.studies.judge import judged
 from caustic_cli.studies.retrace import evaluation_rays, retrace
 from caustic_cli.studies.viewing import tristimulus_values
 

@@ -36,7 +36,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.scene import Scene
 from caustic_cli.schema.table import LensSettings, ScreenSettings, check, default
-from caustic_cli.studies.metrics import judged
+from caustic_cli.studies.judge import judged
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures
 

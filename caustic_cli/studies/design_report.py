@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple
@@ -21,6 +20,7 @@ from caustic_cli.io.files import atomic_file
 from caustic_cli.io.picture import SOFTWARE, codes_of, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
 from caustic_cli.studies.irradiance import in_units
+from caustic_cli.studies.judge import JUDGES, Judge, judge_of
 from caustic_cli.studies.radius import cost_of_radius
 from caustic_cli.studies.report import COLOURS, plain_ticks
 
@@ -61,30 +61,6 @@ class Shown(NamedTuple):
     title: str
     prefix: str | None
     colours: Colours | None = None
-
-
-@dataclass(frozen=True)
-class Judge:
-    """An image by which a lens can be judged."""
-
-    by: str
-    #: Of the keys of its figures.
-    prefix: str
-    #: What its errors are of, the title of the energy balance beside it, and what is said of its figures among those by rays.
-    points: str
-    balance: str
-    beside_rays: str
-
-
-JUDGES = {
-    False: Judge("rays", "", "retraced with independent rays", "where the light goes", ""),
-    True: Judge("waves", "wave_", "wave image of the lens", "where the light goes, by rays", ", by waves"),
-}
-
-
-def judge_of(figures: dict) -> Judge:
-    """The wave image if there is one."""
-    return JUDGES[figures.get("wave_relative_rms") is not None]
 
 
 def write_report(
@@ -395,9 +371,9 @@ def _balance_words(figures: dict) -> str:
     judged by, and what a least radius adds to that."""
     judge, radius = judge_of(figures), figures.get("min_radius")
     words, black = judge.balance, figures.get(f"{judge.prefix}in_black")
-    seen = figures["wave_on_target"] if figures.get("error_by") == "waves" else figures["on_target"]
-    if figures.get("of_source") is not None and not math.isclose(figures["of_source"], seen):  # it emits beside the lens, too
-        words += f"\non the picture {100.0 * figures['of_source']:.3g} % of all that the source emits"
+    emitted = figures.get("of_source")
+    if emitted is not None and not math.isclose(emitted, judge.on_target(figures)):  # it emits beside the lens, too
+        words += f"\non the picture {100.0 * emitted:.3g} % of all that the source emits"
     if black is not None:
         words += f"\nof that on the screen, in black {black:.2%}{judge.beside_rays}"
     if radius is not None and radius["in_black_per_mm"] is not None:

@@ -173,24 +173,6 @@ def _sum(a: np.ndarray) -> float:
     return math.fsum(a.ravel().tolist())
 
 
-def judged(figures: dict, by_waves: bool) -> dict:
-    """The figures of a lens, after the one it is judged by.
-
-    by_waves: judge it by its wave image, where there is one.
-
-    Returns:
-        error, wave_relative_rms or relative_rms, and error_by, waves or rays, both None without a target; the figures; and of them
-        of_source, which the rays give, for the light that lands on the picture by the judged image.
-    """
-    by = "waves" if by_waves and figures.get("wave_relative_rms") is not None else "rays"
-    error = figures.get("wave_relative_rms" if by == "waves" else "relative_rms")
-    own = {"error": error, "error_by": None if error is None else by}
-    found = own | figures | own  # first, and whatever an earlier judgement was
-    if by == "waves" and figures.get("of_source") and figures["on_target"] > 0:
-        found["of_source"] = figures["of_source"] * figures["wave_on_target"] / figures["on_target"]
-    return found
-
-
 def _array(a) -> np.ndarray:
     """An array, or a tensor on any device, as float64."""
     return np.asarray(a.detach().cpu() if hasattr(a, "detach") else a, dtype=np.float64)

@@ -40,6 +40,7 @@ from caustic_cli.project.new import new_project
 from caustic_cli.project.packing import expected_bytes
 from caustic_cli.project.project import Project
 from caustic_cli.scene.light import WAVE_NODES
+from caustic_cli.studies.judge import judge_of
 from caustic_cli.studies.retrace import evaluation_rays
 from caustic_cli.workflow.reporter import Reporter
 
@@ -303,7 +304,7 @@ def cheapest(
 
 def noise_of(figures: Mapping[str, Any]) -> float:
     """What the judge's own light leaves uncertain of an error, by the figures of a design."""
-    return (figures.get("noise") or 0.0) if figures["error_by"] == "rays" else figures.get("wave_spectral_error") or 0.0
+    return judge_of(figures).unsure(figures)
 
 
 def reached(figures: Mapping[str, Any], error: float, quality: str, say: Reporter) -> bool:

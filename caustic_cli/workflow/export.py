@@ -31,6 +31,7 @@ from caustic_cli.optics.system import freeform_of
 from caustic_cli.project.project import Project
 from caustic_cli.project.uptodate import Outputs
 from caustic_cli.scene import Scene
+from caustic_cli.studies.judge import judge_of
 from caustic_cli.studies.picture_error import PictureError, picture_error
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.reporter import Listener, Reporter
@@ -329,7 +330,7 @@ def accuracy_words(figures: dict) -> str:
         return ""
     nx, ny = figures["samples"]
     noise = "" if not figures["noise"] else f" ± {figures['noise']:.2g}"
-    by = "of the wave image" if figures["error_by"] == "waves" else f"by rays{noise}"
+    by = judge_of(figures).words(noise)
     if figures["lens_error"] is None:
         judged = f"its image differs from the lens' own by {figures['error']:.2g} (relative RMS, by rays)"
     else:

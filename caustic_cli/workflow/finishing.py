@@ -15,6 +15,7 @@ from caustic_cli.optics import finishing, ranks
 from caustic_cli.optics.finishing import Relief
 from caustic_cli.optics.scattering import scattered
 from caustic_cli.scene import Scene
+from caustic_cli.studies.judge import judge_of
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.machining import cut_surface
 from caustic_cli.workflow.reporter import Reporter
@@ -135,8 +136,7 @@ def judged(lens: Lens, rays: float | None = None, **how: Any) -> dict[str, Any]:
     figures = lens.render(rays, **how).figures
     if lens.by_waves:
         figures = {**figures, **lens.render_waves(required=False).figures}
-    found = {key: figures.get(key) for key in ("error", "error_by", "noise")}
-    return found if found["error_by"] == "rays" else found | {"noise": None}
+    return {key: figures.get(key) for key in ("error", "error_by")} | {"noise": judge_of(figures).noise(figures)}
 
 
 def compared(lens: Lens, finishes: tuple[str, ...] | None = None) -> list[Mapping[str, Any]]:

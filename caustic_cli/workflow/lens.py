@@ -33,7 +33,7 @@ from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.schema import checks
 from caustic_cli.studies.beam import shaped_figures
-from caustic_cli.studies.metrics import judged
+from caustic_cli.studies.judge import judged
 from caustic_cli.studies.retrace import evaluation_rays, retrace
 from caustic_cli.studies.viewing import tristimulus_values
 from caustic_cli.studies.waves import height_deviation, wave_figures

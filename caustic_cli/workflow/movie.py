@@ -18,6 +18,7 @@ from caustic_cli.inverse.target import grey
 from caustic_cli.io.picture import codes_of
 from caustic_cli.loading import OnDemand
 from caustic_cli.scene import Scene
+from caustic_cli.studies.judge import judge_of
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.viewing import as_lit, separated
 from caustic_cli.workflow.reporter import Reporter
@@ -99,8 +100,7 @@ class Movie(NoMovie):
         self._add(image, f"stage {stage + 1}, {self._last}", f"relative RMS error {self._error(image):.3f}, by {how}")
 
     def finish(self, image: np.ndarray, figures: dict[str, Any], say: Reporter) -> dict[str, str]:
-        how = "independent wave image" if figures["error_by"] == "waves" else f"{figures['rays']:,} independent rays"
-        words = f"relative RMS error {figures['error']:.3f}, {how}"
+        words = f"relative RMS error {figures['error']:.3f}, {judge_of(figures).light(figures)}"
         self._add(image, f"finished after {self._last}" if self._last else "finished", words)
         self.write()
         say.say(f"{self.path}: {len(self.frames)} frames of the design")

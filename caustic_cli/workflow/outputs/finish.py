@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from caustic_cli.optics import finishing as steps_of
+from caustic_cli.studies.judge import judge_of
 from caustic_cli.workflow import finishing
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.outputs.base import Output, Rendering, fingerprint
@@ -80,8 +81,7 @@ class FinishedPart(Output):
         if f := figures.get("finish"):
             rows = []
             if f["nominal_error"] is not None:
-                noise = figures["noise"] if figures["error_by"] == "rays" else None
-                error = f"{finishing.said(figures['error'], noise)} by {figures['error_by']}"
+                error = f"{finishing.said(figures['error'], judge_of(figures).noise(figures))} by {figures['error_by']}"
                 error += f"; as designed {finishing.said(f['nominal_error'], f['nominal_noise'])}"
                 rows.append(("relative RMS error", error))
             if "weaker_error" in f and f["nominal_error"] is not None:

@@ -9,7 +9,7 @@ from caustic_cli.io.files import discard
 from caustic_cli.io.picture import write_image
 from caustic_cli.optics.plan import parse_effects
 from caustic_cli.project.project import WAVE, beside
-from caustic_cli.studies.metrics import judged
+from caustic_cli.studies.judge import judged
 from caustic_cli.studies.viewing import as_lit
 from caustic_cli.workflow.outputs.base import Output, Place, Rendering
 
