@@ -12,10 +12,10 @@ from caustic_cli.io.colorimetry import (
     adaptation,
     delta_e_2000,
     mean_color_difference,
-    srgb_to_xyz,
     xyz_to_lab,
     xyz_to_srgb,
 )
+from caustic_cli.io.picture import to_linear
 from caustic_cli.scene.spectrum import BUILT_IN, built_in, tristimulus, white_point
 
 WHITES = {name: np.array(white_point(built_in(name))) for name in BUILT_IN}
@@ -33,6 +33,12 @@ def labs(n: int, seed: int) -> np.ndarray:
     found[: n // 10, 1:] = 0.0
     found[n // 10 : n // 5, 1:] *= 1e-3
     return found
+
+
+def srgb_to_xyz(codes, white=tuple(D65), axis: int = -1) -> np.ndarray:
+    """X, Y, Z, of the same shape, of R, G, B along an axis, integer codes or values from 0 to 1, adapted to a white."""
+    values = codes / np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else codes
+    return np.moveaxis(np.moveaxis(to_linear(values), axis, -1) @ (adaptation(D65, white) @ XYZ_OF_RGB).T, -1, axis)
 
 
 # differences

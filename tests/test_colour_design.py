@@ -110,6 +110,12 @@ def test_wavelengths_that_mix_no_picture_are_refused(picture, capfd, wavelengths
     assert "--wavelengths" in said and "mix too few colours" in said and len(said.splitlines()) == 1
 
 
+def test_pictures_without_colours_are_refused(tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = run(capfd, "design", "disc", "--color", *TINY, code=2)
+    assert "--color needs the file of a picture" in said and len(said.splitlines()) == 1
+
+
 @pytest.mark.parametrize("wavelengths", [RGB, LASERS, REDDISH])
 @pytest.mark.parametrize("encoding", ["srgb", "linear"])
 def test_a_perfect_image_is_the_picture(codes, picture, tmp_path, wavelengths, encoding):

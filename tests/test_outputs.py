@@ -8,9 +8,13 @@ from typing import Annotated
 import typer
 
 from caustic_cli.commands import options
+from caustic_cli.commands.export import TAKERS
 from caustic_cli.commands.parser import parser
 from caustic_cli.commands.waves import rays_alone
+from caustic_cli.errors import MARK
+from caustic_cli.export import FORMATS
 from caustic_cli.workflow.convergence import NETWORKS, STUDIES
+from caustic_cli.workflow.export import LESS
 from caustic_cli.workflow.outputs import OUTPUTS, outputs_for
 from caustic_cli.workflow.outputs.base import Place, Request
 
@@ -66,3 +70,9 @@ def test_an_error_by_rays_is_excused_where_diffraction_makes_it():
     figures = {"error": 0.07, "relative_rms": 0.87, "noise": 0.002, "on_target": 0.88}
     assert "no fault of the lens" in rays_alone(figures)
     assert "no fault" not in rays_alone(figures | {"error": 2.47, "relative_rms": 2.48})
+
+
+def test_of_a_slow_export_options_are_named_that_its_format_takes():
+    named = [(name, option) for name, words in LESS.items() for option in MARK.findall(words)]
+    assert {name for name, _ in named} == {*FORMATS}
+    assert all(name in TAKERS.get(option, TAKERS["milling"]) for name, option in named)

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from oracle import colour_science
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.spectra import MOST_BYTES, spectrum_of
+from caustic_cli.io.files import read_bytes
+from caustic_cli.io.spectra import MOST_BYTES, TABLE, parse_spectrum
 from caustic_cli.scene import spectrum as module
 from caustic_cli.scene.spectrum import (
     BUILT_IN,
@@ -225,6 +226,12 @@ def test_numbers_of_nodes_that_are_refused(n):
 
 
 # files
+
+
+def spectrum_of(name, directory=Path()):
+    """That of a built-in name, or of a .csv file in a directory, as a project reads it."""
+    path = Path(directory) / name
+    return parse_spectrum(read_bytes(path, MOST_BYTES, TABLE), str(path)) if path.suffix == ".csv" else built_in(str(name))
 
 
 def write(folder: Path, text: str | bytes, name: str = "lamp.csv") -> Path:

@@ -113,9 +113,7 @@ def run(asked: DesignOptions) -> None:
     from caustic_cli.workflow import library  # noqa: PLC0415
 
     for_lamp = says_lamp(project) if asked.resume else asks_for_lamp(asked.given, asked.preset, asked.config)
-    if for_lamp:
-        _refuse_for_lamps(asked)
-        device = "cuda" if asked.device == "cuda" else "cpu"
+    device = _device_for_lamps(asked) if for_lamp else device
     if asked.plan:
         _print_plan(asked, picture)
         return
@@ -158,18 +156,33 @@ def _correct(asked: DesignOptions) -> None:
         console.emit_json(figures)
 
 
-def _refuse_for_lamps(asked: DesignOptions) -> None:
-    """Refuse what no lamp is designed with.
+def _device_for_lamps(asked: DesignOptions) -> str:
+    """The device of the design of a lamp.
 
     Raises:
-        InputError: --plan.
+        InputError: --plan, which no lamp is designed with.
     """
     if asked.plan:
         raise InputError("--plan is for a lens before its light, not for a lamp around it")
+    return "cuda" if asked.device == "cuda" else "cpu"
 
 
 def _check(asked: DesignOptions) -> None:
-    """Refuse numbers out of range, and options beside --resume."""
+    """Refuse numbers out of range, and options that exclude each other."""
+    _check_numbers(asked)
+    if (asked.plan or asked.error is not None) and (names := [n for n in ("quality", "rays") if n in asked.given]):
+        raise InputError(f"--{names[0]} is what {'--plan compares' if asked.plan else '--error chooses'}: leave it out")
+    if asked.plan and asked.error is not None:
+        raise InputError("--plan designs nothing, so --error has no meaning beside it: leave one out")
+    options.refuse_marks(asked, "correct")
+    if asked.resume and (names := _beside_resume(asked)):
+        raise InputError(
+            f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
+            " --iterations and --time-limit can, and project.toml can be edited"
+        )
+
+
+def _check_numbers(asked: DesignOptions) -> None:
     iterations, time_limit = (asked.given.get(setting) for setting in CONTINUED)
     if iterations is not None and not 1 <= iterations <= 10**9:
         raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
@@ -177,17 +190,6 @@ def _check(asked: DesignOptions) -> None:
         raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
     if asked.error is not None and not 0 < asked.error < math.inf:
         raise InputError(f"--error must be greater than 0, got {asked.error:g}")
-    if (asked.plan or asked.error is not None) and (names := [n for n in ("quality", "rays") if n in asked.given]):
-        raise InputError(f"--{names[0]} is what {'--plan compares' if asked.plan else '--error chooses'}: leave it out")
-    if asked.plan and asked.error is not None:
-        raise InputError("--plan designs nothing, so --error has no meaning beside it: leave one out")
-    if not asked.correct and (asked.marks or asked.screen_corners):
-        raise InputError(f"--{'marks' if asked.marks else 'screen-corners'} belongs to --correct, which names the photograph")
-    if asked.resume and (names := _beside_resume(asked)):
-        raise InputError(
-            f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
-            " --iterations and --time-limit can, and project.toml can be edited"
-        )
 
 
 def _print_plan(asked: DesignOptions, picture: Any) -> None:

@@ -150,7 +150,7 @@ def run(asked: ExportOptions) -> None:
     most = MOST_BYTES if asked.max_size is None else options.size_in_bytes("--max-size", asked.max_size)
     options.require_project(project, archives=True)  # before torch is loaded
 
-    from caustic_cli.workflow.export import accuracy_words, export, exporter_of  # noqa: PLC0415
+    from caustic_cli.workflow.export import export, exporter_of  # noqa: PLC0415
 
     exporter, opened = exporter_of(project, asked.at, say, most)
     if asked.ring is not None:
@@ -163,22 +163,29 @@ def run(asked: ExportOptions) -> None:
         script = asked.script and name in TAKERS["script"]
         figures = export(exporter, opened, name, asked.output, script, own, asked.force, asked.at)
         all_figures.append(figures)
-        words = accuracy_words(figures)
-        say.result(f"{figures['file']}: {figures['bytes']:,} bytes{f', {words}' if words else ''}")
-        for file in figures.get("beside", ()):
-            say.result(f"{file}: {Path(file).stat().st_size:,} bytes")
-        if advice := figures.get(name, {}).get("advice"):
-            say.result(advice)
-        if ring := figures.get("ring"):
-            say.result(_ring_words(ring))
-        if register := figures.get("register"):
-            say.result(_register_words(register))
-        if "milling" in figures:
-            from caustic_cli.studies.scallops import rows  # noqa: PLC0415
-
-            say.table("milling", rows(figures["milling"]))
+        _say(figures, figures.get(name, {}).get("advice"), say)
     if asked.json:
         console.emit_json(all_figures[0] if len(formats) == 1 else {"exports": all_figures})
+
+
+def _say(figures: dict[str, Any], advice: str | None, say: console.ConsoleReporter) -> None:
+    """Print the figures of an exported file."""
+    from caustic_cli.workflow.export import accuracy_words  # noqa: PLC0415
+
+    words = accuracy_words(figures)
+    say.result(f"{figures['file']}: {figures['bytes']:,} bytes{f', {words}' if words else ''}")
+    for file in figures.get("beside", ()):
+        say.result(f"{file}: {Path(file).stat().st_size:,} bytes")
+    if advice:
+        say.result(advice)
+    if ring := figures.get("ring"):
+        say.result(_ring_words(ring))
+    if register := figures.get("register"):
+        say.result(_register_words(register))
+    if "milling" in figures:
+        from caustic_cli.studies.scallops import rows  # noqa: PLC0415
+
+        say.table("milling", rows(figures["milling"]))
 
 
 def _is_lamp(project: Path) -> bool:

@@ -7,7 +7,7 @@ from caustic_cli.commands.console import noise, number
 from caustic_cli.loading import OnDemand
 
 irradiance, accuracy_cost = OnDemand("caustic_cli.studies.irradiance"), OnDemand("caustic_cli.inverse.accuracy_cost")
-judge = OnDemand("caustic_cli.studies.judge")
+judge, costs = OnDemand("caustic_cli.studies.judge"), OnDemand("caustic_cli.studies.radius")
 
 #: Keys of the figures of a network's lens that are not values of its inputs.
 OF_LENS = ("relative_rms", "noise", "on_screen", "of_source", "middle_relative_rms")
@@ -133,13 +133,10 @@ def _of_image(figures: dict, prefix: str) -> list[tuple[str, str]]:
 
 def _of_radius(figures: dict) -> list[tuple[str, str]]:
     """What a least radius costs."""
-    from caustic_cli.studies.radius import cost_of_radius  # noqa: PLC0415
-
-    radius = figures.get("min_radius")
-    if radius is None or radius["in_black_per_mm"] is None:
+    if not (radius := costs.known_radius(figures)):
         return []
     with_it, without = radius["start_in_black"], radius["start_in_black_without"]
-    words = f"first surface {with_it:.2%} in black, {without:.2%} without: {cost_of_radius(radius)}"
+    words = f"first surface {with_it:.2%} in black, {without:.2%} without: {costs.cost_of_radius(radius)}"
     return [(f"a radius of {radius['radius_mm']:g} mm", words)]
 
 

@@ -694,3 +694,14 @@ def indices(option: str, text: str) -> tuple[int, int]:
     if any(v != int(v) or v < 0 for v in values):
         raise InputError(f"{option} must be two whole numbers like 3,5, got {text!r}")
     return int(values[0]), int(values[1])
+
+
+def refuse_marks(asked: Any, photo: str) -> None:
+    """Refuse where the screen is in a photograph without one; photo: the option that names it.
+
+    Raises:
+        InputError: marks or corners are given.
+    """
+    names = [name for name in ("marks", "screen-corners") if getattr(asked, name.replace("-", "_"))]
+    if names and not getattr(asked, photo):
+        raise InputError(f"--{names[0]} belongs to --{photo}, which names the photograph")

@@ -302,14 +302,13 @@ def _checked_size(asked: RenderOptions) -> list[int]:
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {asked.tolerance:g}")
     size = tuple(options.both(options.counts("--filter-size", asked.filter_size)))
     radius = asked.tool_radius
-    if radius is not None and not ((asked.report or asked.cut or asked.finish) and radius > 0):
+    if radius is not None and not (any((asked.report, asked.cut, asked.finish)) and radius > 0):
         raise InputError(f"--tool-radius belongs to --report, --cut and --finish and must be greater than 0 mm, got {radius:g}")
     others = ("verify", "explain", "html", "rays-plot", "day", "finish")
     designed = [option for option in others if getattr(asked, option.replace("-", "_"))]
     if asked.cut and designed:
         raise InputError(f"--cut goes without --{designed[0]}, which looks at the surface as designed")
-    if not asked.photo and (asked.marks or asked.screen_corners):
-        raise InputError(f"--{'marks' if asked.marks else 'screen-corners'} belongs to --photo, which names the photograph")
+    options.refuse_marks(asked, "photo")
     if asked.verify not in (None, "mitsuba"):
         raise InputError(f"--verify must be mitsuba, got {asked.verify!r}")
     if asked.verify and asked.screen_at is not None:

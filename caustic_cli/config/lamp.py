@@ -77,6 +77,18 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
         lamp = lamp.filled(base=BOARD, pitch=(2.0 * (radius + lamp.wall),) * 2)
     elif "pitch" in lamp:
         raise InputError("⟨lamp.pitch⟩ belongs to an array of lamps, which ⟨+lens.array⟩ makes")
+    target, screen = _placed(given, by, lamp, aspect)
+    check_all("target", target, *({"flip", "encoding"} & {*target}))
+    design = DesignSettings({"seed": default("design.seed"), **given.get("design", {}), "start": "transport"})
+    full = Settings(SourceSettings(), lens, screen, target, design, lamp=lamp)
+    around, goal = lamp_of(full), goal_of(full)
+    if not goal.distance >= NEAREST * around.radius:
+        raise InputError(f"⟨screen.z⟩ of a lamp must be {NEAREST:g} times ⟨+lamp.radius⟩ or more, got {goal.distance:g} mm")
+    return full
+
+
+def _placed(given: Given, by: Mapping[str, Any], lamp: LampSettings, aspect: float) -> tuple[TargetSettings, ScreenSettings]:
+    """Where the picture of a lamp is, on a screen or in the far field."""
     target, screen = TargetSettings(given.get("target", {})), ScreenSettings()
     far = "far" if by.get("throw") == math.inf else by.get("screen_place")
     if far not in (None, "far"):
@@ -100,13 +112,7 @@ def complete_lamp(given: Given, by: Mapping[str, Any], aspect: float) -> Setting
         raise InputError(
             "⟨lamp.angles⟩ places the picture in the far field: leave out its distance, its size and its shift on a screen"
         )
-    check_all("target", target, *({"flip", "encoding"} & {*target}))
-    design = DesignSettings({"seed": default("design.seed"), **given.get("design", {}), "start": "transport"})
-    full = Settings(SourceSettings(), lens, screen, target, design, lamp=lamp)
-    around, goal = lamp_of(full), goal_of(full)
-    if not goal.distance >= NEAREST * around.radius:
-        raise InputError(f"⟨screen.z⟩ of a lamp must be {NEAREST:g} times ⟨+lamp.radius⟩ or more, got {goal.distance:g} mm")
-    return full
+    return target, screen
 
 
 def _refuse_others(given: Given, by: Mapping[str, Any]) -> None:

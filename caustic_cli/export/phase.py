@@ -103,7 +103,7 @@ def _behind(scene: Scene, field: HeightField, heights: Tensor) -> Optics:
     side = lens.interaction.side
     z = side * (float((side * heights).max()) + CLOSE * lens.opening.reach)
     line = lines_of(replace(scene, screen=Screen(lens.size, z), second_target=None, elements=scene.in_front), field)[0]
-    at = lens.interaction.front(float(heights.mean()), lambda: lens.pupil.z)
+    at = lens.interaction.first(float(heights.mean()), lambda: lens.pupil.z)
     plane, mode = NormalPlane(IDENTITY, z), central_mode(line.system)
     return Optics(line.system, mode, {EXIT: heights}, line.length, line.label, plane, side * (z - at))
 

@@ -11,7 +11,7 @@ zero derivatives OpticStudio uses finite differences, with an error of 0.05 mm a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene.traits import TRAITS
 
 #: Least number of points along an axis in OpticStudio.
 LEAST = 5
@@ -59,7 +60,7 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
         f"! {CREATED}",
         "! Grid Sag, mm; base radius infinity, conic 0; interpolation bicubic",
         f"! vertex {real(vertex - entrance)} mm behind {behind}, index {real(lens.index)}, {_seen(scene.screen, vertex)}",
-        *(f"! {words}" for words in _beside(scene)),
+        *(f"! {words(scene)}" for trait, words in BESIDE.items() if TRAITS[trait].found_in(scene)),
         f"{nx} {ny} {real((grid.x[-1] - grid.x[0]) / (nx - 1))} {real((grid.y[-1] - grid.y[0]) / (ny - 1))} 0 0 0",
         "",
     ]
@@ -75,33 +76,30 @@ def _seen(screen: Screen, vertex: float) -> str:
     return f"screen {real(screen.z - vertex)} mm behind the vertex"
 
 
-def _beside(scene: Scene) -> Iterator[str]:
-    """What belongs to the scene and is not in the file."""
-    lens, screen = scene.lens, scene.screen
-    if scene.source.oblique:
-        yield f"light along ({', '.join(map(real, scene.source.axis))}), a unit vector"
-    if any(screen.shift):
-        yield f"screen decentred by x {real(screen.shift[0])} mm, y {real(screen.shift[1])} mm"
-    if any(screen.tilt):
-        yield f"screen tilted about {_turns(screen.tilt)}"
-    if screen.curved:
-        yield f"the screen is {screen.shape_words()}, which this file does not contain"
-    if scene.elements:
-        among = "along the axis, which flat mirrors fold," if scene.unfolded is not scene else "among other elements"
-        yield f"{among} that this file does not contain"
-    if lens.opening.round:
-        yield f"circular aperture of radius {real(lens.half_size[0])} mm"
-    if lens.gradient is not None:
-        yield f"the index varies, which this file does not contain: {lens.gradient.words(lens.index)}"
-    if lens.round_lenslets:
-        radius, centres = lens.cells.radius, " ".join(f"({real(x)}, {real(y)})" for x, y in lens.cells.centres)
-        yield f"opaque but for circles of radius {real(radius)} mm (a user-defined aperture) about {centres}"
-
-
 def _turns(tilt: Sequence[float]) -> str:
     """The rotations of a screen about its centre, as `scene.screen.tilted` takes them, in words."""
     turns = [*zip("z", tilt[2:], strict=False), *zip("xy", tilt, strict=False)]
     return ", then ".join(f"the fixed {axis} axis by {real(angle)} degrees" for axis, angle in turns if angle)
+
+
+def _round_lenslets(scene: Scene) -> str:
+    cells = scene.lens.cells
+    centres = " ".join(f"({real(x)}, {real(y)})" for x, y in cells.centres)
+    return f"opaque but for circles of radius {real(cells.radius)} mm (a user-defined aperture) about {centres}"
+
+
+#: What belongs to a scene with a trait and is not in the file.
+BESIDE: dict[str, Callable[[Scene], str]] = {
+    "tilted light": lambda s: f"light along ({', '.join(map(real, s.source.axis))}), a unit vector",
+    "shifted screen": lambda s: f"screen decentred by x {real(s.screen.shift[0])} mm, y {real(s.screen.shift[1])} mm",
+    "tilted screen": lambda s: f"screen tilted about {_turns(s.screen.tilt)}",
+    "curved screen": lambda s: f"the screen is {s.screen.shape_words()}, which this file does not contain",
+    "folded axis": lambda s: "along the axis, which flat mirrors fold, that this file does not contain",
+    "other elements": lambda s: "among other elements that this file does not contain",
+    "circular aperture": lambda s: f"circular aperture of radius {real(s.lens.half_size[0])} mm",
+    "gradient index": lambda s: f"the index varies, which this file does not contain: {s.lens.gradient.words(s.lens.index)}",
+    "round lenslets": _round_lenslets,
+}
 
 
 def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:

@@ -13,6 +13,7 @@ depend on the heights (basis matrices, filtered target, blur) is made once.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, cast
@@ -54,6 +55,11 @@ class Evaluation:
     gradients: dict[str, Tensor]
     on_screen: float
     image: Tensor
+
+    @property
+    def finite(self) -> bool:
+        """Whether loss and gradient are finite."""
+        return math.isfinite(self.loss) and bool(torch.isfinite(self.gradient).all())
 
     @property
     def gradient(self) -> Tensor:

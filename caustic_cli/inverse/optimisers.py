@@ -71,7 +71,7 @@ class Adam:
         """
         z, objective = self._objective_here()
         e = objective(z.detach()) if bool(torch.isfinite(z).all()) else None
-        if e is None or not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
+        if e is None or not e.finite:
             raise NotFinite
         return z, e
 
@@ -133,7 +133,7 @@ class QuasiNewton:
         z = self.heights()
         try:
             e = self.objective(z.detach())
-            if not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
+            if not e.finite:
                 raise NotFinite
         except (NoLight, NotFinite):
             if self.method.f is None:

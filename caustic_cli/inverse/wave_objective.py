@@ -158,12 +158,12 @@ class WaveObjective:
         shape = (3, *self.loss.target.shape) if self.colours else self.loss.target.shape
         image = torch.zeros(shape, dtype=torch.float64, device=heights.device)
         leaving = image.new_zeros(image.shape[:-2])
-        xyz = image.new_zeros(3, *image.shape) if self.in_colour else image.new_zeros(0)
+        xyz: Tensor | None = None
         one = image.new_zeros(self.loss.target.shape[-2:])
         owners, own = [part.front for part in self.parts], (self._image(part, changes) for part in self.parts)
         for part, (power, passed) in zip(self.parts, ranks.in_order(own, [one, one.sum()], self.share, owners), strict=True):
             self._channel(image, part)[...] += power
-            xyz += with_colour(None, power, part.line.colour) if self.in_colour else 0.0
+            xyz = with_colour(xyz, power, part.line.colour)
             self._channel(leaving, part)[...] += passed
         image.requires_grad_()
         loss = self.loss(image, leaving, penalty)
@@ -185,7 +185,7 @@ class WaveObjective:
             gradient = gradient + direct
         a = self.apron
         inner, shown = (
-            c[..., a : image.shape[-2] - a, a : image.shape[-1] - a] for c in (image.detach(), xyz if len(xyz) else image)
+            c[..., a : image.shape[-2] - a, a : image.shape[-1] - a] for c in (image.detach(), image if xyz is None else xyz)
         )
         return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()), shown.detach())
 

@@ -78,7 +78,7 @@ def open_archive(path: str | Path, rays: RaySet | None = None) -> tuple[Scene, H
             gradient=_gradient(data),
             **array,
         )
-        place = lens.opening.on_edge if lens.mirror else (0.0, 0.0)  # where light meets it first: at the edge of a mirror
+        place = lens.interaction.first((0.0, 0.0), lambda: lens.opening.on_edge)  # at the edge of a mirror
         x, y = (c * torch.tensor(signs, dtype=torch.float64) for c, signs in zip(place, CORNERS, strict=True))
         lens = replace(lens, offset=Offset(float(field.at(heights, x, y, ((0, 0),))[0].mean())))
         if lens.glass is not None:

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from caustic_cli.io.picture import to_linear, to_srgb
+from caustic_cli.io.picture import to_srgb
 
 #: Chromaticities x, y of the primaries and of D65 in IEC 61966-2-1.
 PRIMARIES = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
@@ -69,19 +69,6 @@ def xyz_to_srgb(xyz: np.ndarray, white: Sequence[float] | np.ndarray, exposure: 
         exposure: factor of the brightness.
     """
     return np.rint(to_srgb(xyz_to_rgb(xyz, white, exposure, axis)) * 255.0).astype(np.uint8)
-
-
-def srgb_to_xyz(codes: np.ndarray, white: Sequence[float] | np.ndarray = tuple(D65), axis: int = -1) -> np.ndarray:
-    """X, Y, Z, of the same shape, of sRGB colours under a white: `white` itself for (255, 255, 255).
-
-    Args:
-        codes: R, G, B along `axis`: uint8 or uint16 codes, or encoded values from 0 to 1.
-        white: (3,) to which they are adapted; sRGB's own by default.
-    """
-    codes = np.asarray(codes)
-    values = codes / np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else codes
-    matrix = adaptation(D65, white) @ XYZ_OF_RGB
-    return np.moveaxis(np.moveaxis(to_linear(values), axis, -1) @ matrix.T, -1, axis)
 
 
 def mixture(rgb: np.ndarray, primaries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -145,9 +145,10 @@ class Defaults:
         """The same where those of the source's centre are traced: also of a near source, whose start takes longer the more there
         are."""
         scene = self.scene
-        centre, blur = replace(scene, source=point_source(scene)), source_spread(scene)
+        centre = replace(scene, source=point_source(scene))
         if centre.source.collimated:
             return 1
+        blur = source_spread(scene)
         return BLURRED if evaluates_by_rows(centre) and (blur is None or blur.points == 1) else SCATTERED
 
     @property

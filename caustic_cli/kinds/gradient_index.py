@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -62,6 +62,8 @@ class IndexPlate(AmongElements):
     def __init__(self, *args: Any, index: tuple[tuple[int, int], tuple[float, float], int], **more: Any):
         self.index = index
         super().__init__(*args, **more)
+
+    idle: ClassVar[Mapping[str, str]] = {}
 
     @classmethod
     def applies(cls, s: Settings) -> bool:

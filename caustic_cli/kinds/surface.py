@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -53,6 +53,7 @@ from caustic_cli.optics.spread import Spread, point_source
 from caustic_cli.optics.spreads import Spreads
 from caustic_cli.optics.system import trace_arguments
 from caustic_cli.scene import Scene
+from caustic_cli.scene.interaction import interaction_of
 from caustic_cli.schema.table import LensSettings, ScreenSettings, check, default
 from caustic_cli.studies.retrace import evaluation_rays, retrace
 
@@ -101,6 +102,21 @@ class OneSurface(OnWaves):
 
     # Settings
 
+    #: Settings of other kinds of design, and what makes a design one.
+    idle: ClassVar[Mapping[str, str]] = {
+        f"lens.{key}": "⟨+lens.gradient⟩ free" for key in ("index_range", "index_control", "index_layers", "with_surface")
+    }
+
+    @classmethod
+    def refuse_idle(cls, given: Mapping[str, Any]) -> None:
+        """Refuse settings, given by path, that this kind of design does not have.
+
+        Raises:
+            InputError: naming one.
+        """
+        for path in filter(given.__contains__, cls.idle):
+            raise InputError(f"⟨{path}⟩ belongs to {cls.idle[path]}")
+
     @classmethod
     def applies(cls, s: Settings) -> bool:
         """Whether a design with these settings is of this kind."""
@@ -126,7 +142,7 @@ class OneSurface(OnWaves):
             InputError: a value is out of range, or two contradict each other.
         """
         width = max(lens.size)
-        thickness = 0.0 if lens.mirror else width / 2.0 if width <= PLATE else WALL + width / 10.0
+        thickness = interaction_of(lens.mirror).first(width / 2.0 if width <= PLATE else WALL + width / 10.0, lambda: 0.0)
         lens = lens.filled(thickness=lens.z_in + WALL if lens.entrance == "parallel" else thickness)
         return lens.filled(height_range=(-width / 10.0, width / 10.0))
 

@@ -15,13 +15,13 @@ this angle is below 1, it cannot intersect the surface again.  For a mirror the 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError, at_most
+from caustic_cli.optics.effects.base import Bounds, ExitBounds
 from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.resolution import Resolution, follows_from_exit, paraxial, traced
@@ -29,42 +29,6 @@ from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System, entrance_of
 from caustic_cli.scene import Scene
-
-
-@dataclass(frozen=True)
-class ExitBounds:
-    """Bounds over all rays at the exit surface."""
-
-    #: Of the surface.
-    slope: float
-    #: n sin i, below 1 there is no total internal reflection.
-    critical: float
-    #: Slope bound times the tangent of the exit ray's angle, below 1 there is no secondary intersection.
-    slope_ratio: float
-    #: Distance of rays from the axis at the greatest height, in half widths of the aperture.
-    reach: float
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds over all rays; see the module.  Angles in rad, slopes dimensionless, heights in mm."""
-
-    #: Angle of rays to z in front of and behind the entrance.
-    incidence: float
-    inside: float
-    exit: ExitBounds
-    #: Largest over all wavelengths.
-    index: float
-    #: Of the glass, mm.
-    depth: float
-    #: Fraction of the power that is reflected twice inside; estimate of the relative RMS that this light adds to the image, see
-    #: `ghost_error`.
-    ghost: float
-    ghost_error: float
-    #: For unpolarised light, the change of the exit's reflectance by the polarisation acquired at the entrance.
-    polarised: float
-    #: Limit set by diffraction, source and pixels.
-    resolution: Resolution
 
 
 def check_exit_above_entrance(scene: Scene, field: HeightField, heights: Tensor) -> None:

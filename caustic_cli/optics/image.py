@@ -32,6 +32,11 @@ class Image(Generic[Amount]):
     #: pixel; None elsewhere.
     xyz: Tensor | None = None
 
+    @property
+    def total(self) -> Tensor:
+        """The image summed over colours, (n_x, n_y)."""
+        return self.image if self.image.ndim == 2 else self.image.sum(0)
+
 
 def with_colour(total: Tensor | None, image: Tensor, colour: tuple[float, float, float] | None) -> Tensor | None:
     """Tristimulus values (3, n_x, n_y) so far, None at first, and those of one more image (n_x, n_y), whose light has one colour:

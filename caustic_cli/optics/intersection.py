@@ -188,6 +188,13 @@ def reference(
     doubtful = (busy & ~closed).nonzero()[:, 0]
     status[doubtful[f(high[doubtful], doubtful)[0] < 0]] = int(Status.MISSED)
     of = (busy & (status == Status.HIT)).nonzero()[:, 0]
+    of = _converged(f, of, t, low, high, close, narrow)
+    status[of] = int(Status.UNRESOLVED)
+    return t, within(status, t, (ox, oy), (dx, dy), radius)
+
+
+def _converged(f, of: Tensor, t: Tensor, low: Tensor, high: Tensor, close: Tensor, narrow: Tensor) -> Tensor:
+    """Safeguarded Newton steps of the rays `of` to roots t in [low, high], all (N,), in place; the rays without one."""
     for _ in range(MOST_STEPS):
         if not len(of):
             break
@@ -201,8 +208,7 @@ def reference(
         after = torch.where((after > a) & (after < b), after, 0.5 * (a + b))
         low[some], high[some], t[some] = a, b, torch.where(done, at, after)
         of = of[~done]
-    status[of] = int(Status.UNRESOLVED)
-    return t, within(status, t, (ox, oy), (dx, dy), radius)
+    return of
 
 
 def _first_brackets(f, low: Tensor, high: Tensor, f_low: Tensor, rise: Tensor, fall: Tensor):

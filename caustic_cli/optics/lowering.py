@@ -49,28 +49,39 @@ def lowered(tracer, previous: Fused | None) -> Fused | None:
 def _pencil(tracer, pencil: Bundle, previous: Fused | None) -> Fused | None:
     """All of a tracer's system as one kernel for the rays of a source point, or of one at infinity: a flat entrance in front of the
     last surface, or a mirror alone."""
-    system = tracer.system
-    if _needs_stages(tracer) or not system.lit:
+    if _needs_stages(tracer) or not tracer.system.lit:
         return None
-    if len(system.elements) == 1 and pencil.reflects:
-        (exit,), pupil = system.elements, system.pupil
-        if not (exit.reflects and _is_upright(exit, pupil)):
+    match tracer.system.elements:
+        case (exit,):
+            ways = _reflected(tracer, exit, pencil)
+        case (entrance, exit):
+            ways = _refracted(tracer, entrance, exit)
+        case _:
             return None
-        pencil = pencil.through(_clear(exit, pupil, pencil.sample))
-        return pencil.maker(tracer.backend)(exit.surface, pencil, (1.0, "none"), -1.0, "none", previous)
-    if len(system.elements) != 2:
+    if ways is None:
         return None
-    (entrance, exit), pupil = system.elements, system.pupil
+    pencil = pencil.through(_clear(exit, tracer.system.pupil, pencil.sample))
+    return pencil.maker(tracer.backend)(exit.surface, pencil, *ways, previous)
+
+
+def _reflected(tracer, exit: Element, pencil: Bundle) -> tuple | None:
+    """What happens to a pencil at the entrance and at the exit, a mirror alone, as arguments of the kernel; None where that has
+    none."""
+    if not (pencil.reflects and exit.reflects and _is_upright(exit, tracer.system.pupil)):
+        return None
+    return (1.0, "none"), -1.0, "none"
+
+
+def _refracted(tracer, entrance: Element, exit: Element) -> tuple | None:
+    """The same behind a flat entrance."""
+    pupil = tracer.system.pupil
     upright = isinstance(entrance.surface, Plane) and entrance.pose == Pose((0.0, 0.0, pupil.z)) and not entrance.reflects
     if not (upright and _is_plain(exit, pupil) and entrance.aperture == pupil.aperture):
         return None
     before, inside, outside = (medium.index_at(tracer.wavelength) for medium in tracer.media)
     if inside <= before or (exit.fresnel == "schlick" and inside < outside):
         return None
-    pencil = pencil.through(_clear(exit, pupil, pencil.sample))
-    return pencil.maker(tracer.backend)(
-        exit.surface, pencil, (inside / before, entrance.fresnel), inside / outside, exit.fresnel, previous
-    )
+    return (inside / before, entrance.fresnel), inside / outside, exit.fresnel
 
 
 def _clear(exit: Element, pupil: Pupil, sample: Sample) -> Tensor | None:

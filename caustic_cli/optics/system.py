@@ -247,10 +247,7 @@ class System:
 
     def media(self) -> tuple[Medium, ...]:
         """The medium in front of each element, and behind the last."""
-        media = [self.object_space]
-        for element in self.elements:
-            media.append(media[-1] if element.reflects else element.behind)
-        return tuple(media)
+        return tuple(self.object_space if k is None else self.elements[k].behind for k in self.owners())
 
     def owners(self) -> tuple[int | None, ...]:
         """Index of the element in front of each of `media`, None for the first medium."""

@@ -11,9 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from caustic_cli.config.settings import Given, Settings
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.colorimetry import D65, XYZ_OF_RGB, mean_color_difference, mixture
 from caustic_cli.io.picture import Picture
+from caustic_cli.scene import Screen
 from caustic_cli.scene.light import RGB, Light
+from caustic_cli.schema.table import TargetSettings
+
+COLOR_GLASS = "N-BK7"  # for a coloured picture without glass or index, since dispersion has to be known
 
 
 def powers(rgb: np.ndarray, light: Light) -> np.ndarray:
@@ -36,8 +43,51 @@ def filled(source: Mapping[str, Any], picture: Picture) -> dict[str, Any]:
     return found
 
 
+def completed(given: Given, goal: TargetSettings, picture: Picture) -> Given:
+    """Settings by section with the light of a coloured picture, see `filled`; unchanged of another.
+
+    Raises:
+        InputError: the picture has no colours, or as of `filled`.
+    """
+    if not goal.color:
+        return given
+    if picture.values.ndim < 3:
+        raise InputError("⟨target.color⟩ needs the file of a picture: one by name, or an array (n_x, n_y), has no colours")
+    return {**given, "source": filled(given.get("source", {}), picture)}
+
+
+def with_glass(s: Settings) -> Settings:
+    """Settings with the wavelengths of a coloured picture, and a glass whose dispersion is known; unchanged of another."""
+    if not s.target.color:
+        return s
+    lens = s.lens if "index" in s.lens else s.lens.filled(glass=COLOR_GLASS)
+    return s.changed(source=s.source.filled(wavelengths=RGB), lens=lens)
+
+
+def on_screen(picture: np.ndarray, light: Light, size: tuple[float, float], screen: Screen, flip: str) -> np.ndarray:
+    """`target_on_screen` of a picture (a, b), (n_x, n_y), or of R, G, B (3, a, b), (3, n_x, n_y): the power of each wavelength."""
+    if picture.ndim == 2:
+        return target_on_screen(picture, size, screen, flip)
+    mixed = powers(picture, light)
+    whole = target_on_screen(mixed.sum(0), size, screen, flip)
+    return np.stack([target_on_screen(c, size, screen, flip) if c.any() else 0.0 * whole for c in mixed])
+
+
+def refuse_without_light(target: np.ndarray, light: Light) -> None:
+    """Refuse a second target in colours (3, n_x, n_y) of which the light has nothing.
+
+    Raises:
+        InputError: naming the wavelength.
+    """
+    for wavelength, part, goal in zip(light.wavelengths, light.fractions, target, strict=True) if target.ndim == 3 else ():
+        if goal.any() and not part:
+            raise InputError(f"⟨second.file⟩ needs light of {wavelength:g} nm, of which the source of both pictures has none")
+
+
 def beyond_words(picture: Picture, light: Light) -> str:
     """How much of the picture has colours that its light cannot mix, and what that costs; "" for none."""
+    if not light.color:
+        return ""
     rgb = picture.irradiance()
     shown, moved = mixture(rgb, light.primaries)
     if not moved.any():

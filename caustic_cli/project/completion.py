@@ -31,9 +31,9 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.kinds import complete_design, kind_of
 from caustic_cli.kinds.defaults import Defaults
+from caustic_cli.project.colours import with_glass
 from caustic_cli.scene import Offset, Source, sources
 from caustic_cli.scene.interaction import Interior, interaction_of
-from caustic_cli.scene.light import RGB
 from caustic_cli.scene.screen import FOCAL
 from caustic_cli.schema.table import LensSettings, Parameters, ScreenSettings, SourceSettings, TargetSettings, check
 
@@ -41,7 +41,6 @@ DEFAULT_RESOLUTION = 250
 FAR = "far"  # the place of a screen in the far field
 STEEPEST = 1.25  # least radius of a derived sphere in half diagonals of the lens: slopes up to 1.3
 OBLONG = 2.5  # anamorphic ratio of the magnifications from which on another lens shape is recommended
-COLOR_GLASS = "N-BK7"  # for a coloured picture without glass or index, since dispersion has to be known
 
 
 def complete(
@@ -67,7 +66,7 @@ def complete(
     refuse_contradictions(s)
     if s.target.sheet:
         aspect, lit = _aspect_of_a_sheet(s, aspect), (1.0, 1.0)
-    s = _in_colour(s) if s.target.color else s
+    s = with_glass(s)
     over = Ranges.parse(s.design.over)
     s = s.changed(screen=_placed(s, by, aspect, "z" in given.get("screen", {}), over))
     _check_sizes(s)
@@ -97,12 +96,6 @@ def _aspect_of_a_sheet(s: Settings, aspect: float) -> float:
     return aspect * array[0] / array[1]
 
 
-def _in_colour(s: Settings) -> Settings:
-    """Settings with the wavelengths of a coloured picture, and a glass whose dispersion is known."""
-    lens = s.lens if "index" in s.lens else s.lens.filled(glass=COLOR_GLASS)
-    return s.changed(source=s.source.filled(wavelengths=RGB), lens=lens)
-
-
 def _placed(s: Settings, by: Parameters, aspect: float, placed: bool, over: Ranges | None) -> ScreenSettings:
     """The screen at its distance, with the size and the pixels that are given; placed: whether its distance is given as such."""
     screen, side = s.screen, interaction_of(s.lens.mirror).side
@@ -114,15 +107,21 @@ def _placed(s: Settings, by: Parameters, aspect: float, placed: bool, over: Rang
         screen = screen.changed(z=side * by.throw)
     elif not placed:
         screen = screen.changed(z=side * screen.z)
+    screen = _sized(screen, by, aspect)
+    if over and "throw" in over.keys:
+        screen = screen.changed(z=middle_distance(over, screen.z, side, by.throw is not None or placed))
+    return screen
+
+
+def _sized(screen: ScreenSettings, by: Parameters, aspect: float) -> ScreenSettings:
+    """The screen with the size and the pixels that are given."""
     if by.screen_size is not None:
-        width = by.screen_size[0]
-        screen = screen.changed(size=(width, by.screen_size[1] if len(by.screen_size) == 2 else width * aspect))
+        width, height = (*by.screen_size, by.screen_size[0] * aspect)[:2]
+        screen = screen.changed(size=(width, height))
     if by.resolution is not None:
         screen = screen.without("resolution")
         if len(by.resolution) == 2:
             screen = screen.changed(resolution=by.resolution)
-    if over and "throw" in over.keys:
-        screen = screen.changed(z=middle_distance(over, screen.z, side, by.throw is not None or placed))
     return screen
 
 

@@ -15,6 +15,7 @@ from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.io.files import Piped
 from caustic_cli.io.photometry import SUFFIXES, read_photometry
 from caustic_cli.io.picture import Picture, is_road, read_picture
+from caustic_cli.kinds import kind_of
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.obstruction import clear_shift
 from caustic_cli.project import attachments, colours, uptodate
@@ -58,23 +59,18 @@ def new_project(
     )
     if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
         del said["source"]["weights"]
-    if goal.color:
-        if isinstance(target, Picture):
-            raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
-        said["source"] = colours.filled(said.get("source", {}), picture)
+    said = colours.completed(said, goal, picture)
     full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
     if full.lamp is not None:
         full = attachments.named_in_project(_with_picture(full, picture))
         return Project(out, full, picture, uptodate.digest(full, picture)), said
-    for key in ("index_range", "index_control", "index_layers", "with_surface"):
-        if f"lens.{key}" in given and full.lens.gradient != "free":
-            raise InputError(f"⟨lens.{key}⟩ belongs to ⟨+lens.gradient⟩ free")
+    kind_of(full).refuse_idle(given)
     if full.lens.mirror and "shift" not in full.screen and any(shift := _beside_the_light(full)):
         said["screen"] = said.get("screen", {}) | {"shift": list(shift)}
         full = complete(said, picture.aspect, parameters, picture.lit, picture.gaps)
         say(f"the screen is shifted by {shift[0]:g},{shift[1]:g} mm, beside the light of its source; ⟨+screen.shift⟩ places it")
     settings.refuse_unused(full.source, given, [stage.source for stage in full.design.stages])
-    if goal.color and (beyond := colours.beyond_words(picture, settings.build_light(full))):
+    if beyond := colours.beyond_words(picture, settings.build_light(full)):
         say(beyond)
     full = _with_picture(full, picture)
     full = attachments.named_in_project(full)

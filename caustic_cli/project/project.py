@@ -34,7 +34,7 @@ from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, checkpoint, colours
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.completion import complete, complete_source
-from caustic_cli.scene import Light, Scene, Screen, sources
+from caustic_cli.scene import Scene, sources
 from caustic_cli.scene.sources.section import content
 from caustic_cli.schema.table import RoomSettings, SourceSettings, TargetSettings
 
@@ -118,8 +118,7 @@ class Project:
             for file in (name, *(table[row.key] for table, row in attachments.names_in(given))):
                 _within(file)
             picture = read_picture(path / name, goal.encoding == "linear", goal.color)
-            if goal.color:
-                given["source"] = colours.filled(given.get("source", {}), picture)
+            given = colours.completed(given, goal, picture)
             full = complete(attachments.attached(attachments.located(given, path)), picture.aspect)
             if full.lamp is None:
                 build_stages(full), build_options(full)  # validates the design, too
@@ -181,8 +180,7 @@ class Project:
             other = dict(complete_sunlight(SourceSettings(other), room, s.lens.array))
         settings.refuse_unused(other, given)
         # Further conditions of a design on its source do not apply to an image.
-        if s.target.color:
-            other = colours.filled(other, self.picture)
+        other = colours.completed({"source": other}, s.target, self.picture)["source"]
         source = complete_source(SourceSettings.of(other), s.lens)
         lens, screen = s.lens.changed(**own.get("lens", {})), s.screen.changed(**own.get("screen", {}))
         return settings.build_scene(s.changed(source=source, lens=lens, screen=screen))
@@ -192,7 +190,7 @@ class Project:
         t, light = self.settings.target, self.picture.irradiance()
         if t.sheet:
             return np.mean([own / own.sum() for own in self.targets(scene)], axis=0)
-        return self.of_picture(light, t.size, scene.screen, scene.light)
+        return colours.on_screen(light, scene.light, t.size, scene.screen, t.flip)
 
     def second_target(self, scene: Scene) -> np.ndarray | None:
         """The second target on its screen, (n_x, n_y), or (3, n_x, n_y) in the colours of the first, or None.
@@ -203,20 +201,10 @@ class Project:
         picture, section = self.second, self.settings.second
         if picture is None or section is None or scene.second_target is None or scene.second_target.screen is None:
             return None
-        found = self.of_picture(picture, section.size, scene.second_target.screen, scene.light)
-        for wavelength, part, goal in zip(scene.light.wavelengths, scene.light.fractions, found, strict=False):
-            if scene.colored and goal.any() and not part:
-                raise InputError(f"⟨second.file⟩ needs light of {wavelength:g} nm, of which the source of both pictures has none")
-        return found
-
-    def of_picture(self, picture: np.ndarray, size: tuple[float, float], screen: Screen, light: Light) -> np.ndarray:
-        """A picture (a, b), or R, G, B (3, a, b), on a screen: (n_x, n_y), or (3, n_x, n_y), the power of each wavelength."""
         flip = self.settings.target.flip
-        if not self.settings.target.color:
-            return target_on_screen(picture, size, screen, flip)
-        mixed = colours.powers(picture, light)
-        whole = target_on_screen(mixed.sum(0), size, screen, flip)
-        return np.stack([target_on_screen(c, size, screen, flip) if c.any() else 0.0 * whole for c in mixed])
+        found = colours.on_screen(picture, scene.light, section.size, scene.second_target.screen, flip)
+        colours.refuse_without_light(found, scene.light)
+        return found
 
     def targets(self, scene: Scene) -> list[np.ndarray]:
         """The target of each lenslet on the screen of the scene, (n_x, n_y), j fastest; a single one for a common picture."""

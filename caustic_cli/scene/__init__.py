@@ -119,11 +119,6 @@ class Scene:
             check_positions(self.elements, (self.lens.z_in, self.lens.offset.thickness), self.source.nearest, self.screen.z)
 
     @property
-    def second_setting(self) -> str:
-        """Path of the setting by which a lens has two free-form sides."""
-        return "second.file" if self.second_target is None else self.second_target.setting
-
-    @property
     def in_front(self) -> tuple[Component, ...]:
         """The elements in front of the lens, in the order in which light reaches them."""
         return tuple(e for e in self.elements if e.z < self.lens.z_in)
@@ -240,7 +235,7 @@ class Scene:
                 for k, (scene_of_member, fraction) in enumerate(each)
                 for band in scene_of_member.bands
             )
-        states = (0.0, 90.0) if self.light.tracked and self.light.polarisation is None else (self.light.polarisation,)
+        states = self.light.states
         if not (self.dispersive or self.colored):
             if len(states) == 1:
                 return (Band(self),)

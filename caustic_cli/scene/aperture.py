@@ -112,6 +112,10 @@ class Aperture:
         """The aperture larger by a factor."""
         return type(self)(larger(self.half_size, factor))
 
+    def words(self, said: Callable[[tuple[float, ...]], str]) -> str:
+        """Shape and size, of which `said` says the lengths, mm."""
+        return said(larger(self.half_size, 2.0))
+
     def chord(self, at: float, along: int) -> float:
         """Half the length, mm, of the line across the aperture along x (0) or y (1) at this distance from the axis."""
         return self.half_size[along]
@@ -183,6 +187,10 @@ class CircularAperture(Aperture):
     def farthest(self, distance: Callable[[np.ndarray, np.ndarray], np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """As of an aperture."""
         return distance(x, y) + self.radius
+
+    def words(self, said: Callable[[tuple[float, ...]], str]) -> str:
+        """As of an aperture."""
+        return f"round, {said((2.0 * self.radius,))} across"
 
     def chord(self, at: float, along: int) -> float:
         """As of an aperture."""

@@ -11,11 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
 from caustic_cli.errors import InputError
+
+Met = TypeVar("Met")
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,9 @@ class Refracting:
     beyond: ClassVar[str] = "behind"
     #: Effects and errors that do not apply, by their names, with the reason.
     lacks: ClassVar[Mapping[str, str]] = {}
+    #: What rays inside do with the body, and the side from which its picture is seen, in words.
+    way: ClassVar[str] = "cross the lens"
+    seen_from: ClassVar[str] = "from behind, as through a translucent one"
     #: Why there is no dispersion although there are several wavelengths.
     achromatic: ClassVar[str] = "the lens' index is the same at all wavelengths"
 
@@ -55,9 +60,9 @@ class Refracting:
         """z that the surface must not fall below, mm: of the flat face where light enters."""
         return z_in
 
-    def front(self, z_in: float, edge: Callable[[], float]) -> float:
-        """z of the aperture that a source illuminates, mm: of the entrance, or of the edge of the surface."""
-        return z_in
+    def first(self, entrance: Met, surface: Callable[[], Met]) -> Met:
+        """Something of the side that light meets first: of the entrance, or of the surface."""
+        return entrance
 
     def entered(self, z_in: float, z: np.ndarray) -> np.ndarray:
         """z at which light enters the body on its way to points of the surface at z, mm."""
@@ -126,6 +131,8 @@ class Reflecting(Refracting):
         "ghosts": "there is no glass",
         "index": "a mirror has no index",
     }
+    way: ClassVar[str] = "meet the mirror"
+    seen_from: ClassVar[str] = "from the mirror’s side"
     achromatic: ClassVar[str] = "a mirror treats all wavelengths alike"
 
     def interior(self, glass: Interior) -> Interior:
@@ -140,9 +147,9 @@ class Reflecting(Refracting):
         """None."""
         return -math.inf
 
-    def front(self, z_in: float, edge: Callable[[], float]) -> float:
-        """Of the edge."""
-        return edge()
+    def first(self, entrance: Met, surface: Callable[[], Met]) -> Met:
+        """Of the surface."""
+        return surface()
 
     def entered(self, z_in: float, z: np.ndarray) -> np.ndarray:
         """At the surface itself."""

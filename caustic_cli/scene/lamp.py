@@ -249,6 +249,9 @@ class Lamp:
                 f"⟨lamp.flat⟩ must be greater than the height of the chip, {self.chip.top:g} mm, and less than"
                 f" {self.radius - self.wall:g} mm, with one free-form surface, got {self.flat:g} mm and {self.surfaces}"
             )
+        self._check_solid()
+
+    def _check_solid(self) -> None:
         if not 1.0 < self.index <= 5.0:
             raise InputError(f"⟨lens.index⟩ of a lamp must be greater than 1 and at most 5, got {self.index!r}")
         if not all(0 <= s < math.inf for s in (self.base, self.flange)) or (self.flange > 0 and self.base == 0):

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -275,7 +275,7 @@ class Lens:
     @cached_property
     def pupil(self) -> Pupil:
         """Its aperture where light meets it first: at the entrance, or at the mean height of the edge of a mirror."""
-        return Pupil(self.opening, self.interaction.front(self.z_in, self._edge))
+        return Pupil(self.opening, self.interaction.first(self.z_in, self._edge))
 
     def _edge(self) -> float:
         """Mean height of the edge of the base surface, mm, to second order."""
@@ -285,10 +285,12 @@ class Lens:
     @property
     def lowest(self) -> float:
         """Lower bound of z over the surface that light meets first, the entrance or a mirror, mm."""
-        if self.mirror:
-            corner = (np.array([c]) for c in self.half_size)
-            return self.offset.thickness + min(0.0, float(self.offset.sag(*corner).min())) + self.height_range[0]
-        return self.z_in + (0.0 if self.entrance is None else min(0.0, float(self.entrance.heights.min())))
+        entrance = 0.0 if self.entrance is None else min(0.0, float(self.entrance.heights.min()))
+        return self.interaction.first(self.z_in + entrance, self._lowest_of_surface)
+
+    def _lowest_of_surface(self) -> float:
+        corner = (np.array([c]) for c in self.half_size)
+        return self.offset.thickness + min(0.0, float(self.offset.sag(*corner).min())) + self.height_range[0]
 
     @property
     def floor(self) -> float:
@@ -323,6 +325,7 @@ class Lens:
 
     def scaled(self, factor: float) -> Lens:
         """The lens larger by a factor, with the same angles, index and transmittance."""
+        parts: dict[str, Any] = {"entrance": self.entrance, "gradient": self.gradient, "outline": self.outline}
         return replace(
             self,
             size=larger(self.size, factor),
@@ -332,9 +335,7 @@ class Lens:
             height_range=larger(self.height_range, factor),
             absorption=self.absorption / factor,
             border=factor * self.border,
-            entrance=None if self.entrance is None else self.entrance.scaled(factor),
-            gradient=None if self.gradient is None else self.gradient.scaled(factor),
-            outline=None if self.outline is None else self.outline.scaled(factor),
+            **{name: part.scaled(factor) for name, part in parts.items() if part is not None},
         )
 
     def height_bounds(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -95,6 +95,11 @@ class Light:
         """Leading dimensions of an image: (3,), its colour channels, or ()."""
         return (len(RGB),) if self.color else ()
 
+    @property
+    def states(self) -> tuple[float | None, ...]:
+        """Angles of the linear polarisations that it is the even mixture of, degrees: two of natural light that is tracked."""
+        return (0.0, 90.0) if self.tracked and self.polarisation is None else (self.polarisation,)
+
     @cached_property
     def continuum(self) -> Measure | None:
         """The continuous spectrum that the wave image is of: its own, or that of white light; None for spectral lines."""

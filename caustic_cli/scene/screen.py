@@ -147,6 +147,9 @@ class Screen:
             )
         if len(self.tilt) not in (2, 3):
             raise InputError(f"⟨screen.tilt⟩ must be two or three angles, got {len(self.tilt)}")
+        self._check_shape()
+
+    def _check_shape(self) -> None:
         if any(isinstance(r, bool) or not isinstance(r, int | float) or math.isnan(r) or r == 0 for r in self.radius):
             raise InputError(f"⟨screen.radius⟩ must be non-zero numbers of mm or inf, got {list(self.radius)}")
         if self.radius[0] != self.radius[1] and all(map(math.isfinite, self.radius)):

@@ -21,7 +21,7 @@ from caustic_cli.io.picture import SOFTWARE, codes_of, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
 from caustic_cli.studies.irradiance import in_units
 from caustic_cli.studies.judge import JUDGES, Judge, judge_of
-from caustic_cli.studies.radius import cost_of_radius
+from caustic_cli.studies.radius import cost_of_radius, known_radius
 from caustic_cli.studies.report import COLOURS, plain_ticks
 
 #: Upper end of an irradiance scale below which ticks cannot be placed, as for a black image.
@@ -369,14 +369,14 @@ def _draw_energy_balance(axis: Axes, figures: dict) -> None:
 def _balance_words(figures: dict) -> str:
     """Title of the energy balance: the fraction of all that the source emits, light in black regions of the image that the lens is
     judged by, and what a least radius adds to that."""
-    judge, radius = judge_of(figures), figures.get("min_radius")
-    words, black = judge.balance, figures.get(f"{judge.prefix}in_black")
+    judge, radius = judge_of(figures), known_radius(figures)
+    words, black = judge.balance, judge.figure(figures, "in_black")
     emitted = figures.get("of_source")
-    if emitted is not None and not math.isclose(emitted, judge.on_target(figures)):  # it emits beside the lens, too
+    if emitted is not None and not math.isclose(emitted, judge.figure(figures, "on_target")):  # it emits beside the lens, too
         words += f"\non the picture {100.0 * emitted:.3g} % of all that the source emits"
     if black is not None:
         words += f"\nof that on the screen, in black {black:.2%}{judge.beside_rays}"
-    if radius is not None and radius["in_black_per_mm"] is not None:
+    if radius:
         words += f"\na radius of {radius['radius_mm']:g} mm on the first surface, in black: {cost_of_radius(radius)}"
     return words
 

@@ -151,9 +151,8 @@ def finite_difference(
     heights = heights.detach().double()
     above, below = heights + step * direction, heights - step * direction
     distance = float((above - below)[tuple(control)])  # not 2 step: a height near 5 mm has only so many digits
-    images = [expose(scene, field, h, sampler, filter, requests=STAGES).image for h in (above, below)]
-    difference = (images[0] - images[1]) / distance
-    return difference.sum(0) if scene.colored else difference
+    images = [expose(scene, field, h, sampler, filter, requests=STAGES) for h in (above, below)]
+    return (images[0].total - images[1].total) / distance
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def _from_infinity(scene: Scene, n: int, rng: np.random.Generator) -> tuple[np.n
         across, d = d[2], _turned(np.array(source.axis), d)
         one = d[2] / (across * source.axis[2])  # the radiance's part that the aperture receives
         one = one / (1.0 if source.brightness is None else one.mean())
-    x, y = _on_pupil(pupil, u, v)
+    x, y = pupil.aperture.spread(u, v)
     if source.profile is not None:
         one = one * _profile(source.profile, x / rx, y / ry) / _mean(source.profile, pupil)
     return _before(scene, x, y, d), d, one
@@ -86,7 +86,7 @@ def _of_file(scene: Scene, n: int, rng: np.random.Generator) -> tuple[np.ndarray
 def _of_beam(scene: Scene, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rays normal to the wavefronts of a laser beam, weighted by its irradiance on the pupil."""
     source, pupil = scene.source, scene.pupil
-    x, y = _on_pupil(pupil, *rng.random((2, n)))
+    x, y = pupil.aperture.spread(*rng.random((2, n)))
     sines = np.zeros((2, n))
     if source.brightness is not None:
         sines = np.array(source.frame)[:, None] * _on_picture(source.brightness, n, rng)
@@ -101,14 +101,6 @@ def _of_emission(scene: Scene, n: int, rng: np.random.Generator) -> tuple[np.nda
     columns = zip(*((*s.origin[:2], *s.direction, s.power) for s in parts), strict=True)
     x, y, *d, power = (np.concatenate([c.numpy() for c in column]) for column in columns)
     return _before(scene, x, y, np.array(d)), np.array(d), power * len(power)
-
-
-def _on_pupil(pupil: Pupil, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points uniform over the aperture, mm."""
-    rx, ry = pupil.half_size
-    if not pupil.aperture.round:
-        return (2 * u - 1) * rx, (2 * v - 1) * ry
-    return rx * np.sqrt(u) * np.cos(2 * np.pi * v), rx * np.sqrt(u) * np.sin(2 * np.pi * v)
 
 
 def _before(scene: Scene, x: np.ndarray, y: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -127,7 +119,7 @@ def _mean(profile: np.ndarray, pupil: Pupil) -> float:
     """Mean of a relative irradiance over the aperture."""
     line = (np.arange(2000) + 0.5) / 1000 - 1
     x, y = np.meshgrid(line, line, indexing="ij")
-    within = x * x + y * y <= 1 if pupil.aperture.round else np.ones_like(x, bool)
+    within = pupil.aperture.covers(x, y)
     return _profile(profile, x[within], y[within]).mean()
 
 

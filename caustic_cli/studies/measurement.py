@@ -110,8 +110,7 @@ class Benchmark:
 
     def image(self, setting: Setting, seed: int) -> Tensor:
         """The image of a setting with the rays of `seed`: (n_x, n_y) float64, summed over colours."""
-        found = expose(self.scene, self.heightfield, self.heights, self.sampler(setting, seed), setting.filter, setting.dtype).image
-        return found.sum(0) if self.scene.colored else found
+        return expose(self.scene, self.heightfield, self.heights, self.sampler(setting, seed), setting.filter, setting.dtype).total
 
     def reference(self, filter: Filter) -> Reference:
         """The reference image, reconstructed with `filter`.

@@ -6,6 +6,12 @@ from __future__ import annotations
 SMALL = 5e-5
 
 
+def known_radius(figures: dict) -> dict | None:
+    """The figures `min_radius` of a design, None where they say no cost."""
+    radius = figures.get("min_radius")
+    return radius if radius and radius["in_black_per_mm"] is not None else None
+
+
 def cost_of_radius(radius: dict) -> str:
     """The change of the light in black per mm of radius, from the figures `min_radius` of a design, as a clause: with its noise if
     it has one; no difference where it is within that."""

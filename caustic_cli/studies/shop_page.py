@@ -119,9 +119,7 @@ def _table(rows: list[tuple[str, str]]) -> str:
 
 def _part(scene: Scene, report: dict[str, Any]) -> list[tuple[str, str]]:
     lens = scene.lens
-    wide, high = lens.size
-    shape = f"round, {wide:g} mm across" if lens.opening.round else f"{wide:g} x {high:g} mm"
-    rows = [("optical area", shape)]
+    rows = [("optical area", lens.opening.words(lambda lengths: " x ".join(f"{c:g}" for c in lengths) + " mm"))]
     if scene.elements:
         places = ", ".join(f"a {e.kind} at {e.z - lens.z_in:+g} mm" for e in scene.elements)
         rows.append(("stands among", f"{places}, along the axis from the part; the limits below are those of all together"))

@@ -14,11 +14,9 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, InitialHeights
 from caustic_cli.inverse.parametrisation import Architecture, Parametrisation
 from caustic_cli.inverse.problem import Options
-from caustic_cli.io.picture import Picture
 from caustic_cli.kinds import OneSurface, problem_of
-from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
-from caustic_cli.workflow.comparison import picture_of_disc
+from caustic_cli.workflow.comparison import project_of_disc
 from caustic_cli.workflow.preparation import first_heights
 
 BY_RAYS = "⟨networks⟩ are compared on ray images, and no stage of this project is on rays"
@@ -121,9 +119,7 @@ class _Study:
     """The problem of a project, or of a bright disc without one, and designs of it on the rays of its last stage alone."""
 
     def __init__(self, project: Project | None, device: str, dtype: torch.dtype | None, seed: int | None, rays: int | None):
-        if project is None:
-            full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
-            project = Project(None, full, Picture(picture_of_disc(), "linear"))
+        project = project or project_of_disc(PIXELS, CONTROL)
         chosen = project.settings.design.without("robust")
         project = replace(project, settings=project.settings.changed(design=chosen))
         self.over = project.over

@@ -135,9 +135,7 @@ def timed_designs(
     Raises:
         InputError, CausticError: as of `variants` and `TimedDesign`.
     """
-    if project is None:
-        full = complete({"screen": {"resolution": [PIXELS, PIXELS]}, "lens": {"control": [CONTROL, CONTROL]}}, 1.0)
-        project = Project(None, full, Picture(picture_of_disc(), "linear"))
+    project = project or project_of_disc(PIXELS, CONTROL)
     problem = problem_of(project, device)
     runs = [TimedDesign(name, problem.varied(*how)) for name, *how in variants(problem, project.settings, dtype, seed)]
     if type(problem) is OneSurface and problem.options.parametrisation.free:
@@ -168,6 +166,12 @@ def lens_of_disc() -> tuple[Scene, HeightField, Tensor]:
 def disc(scene: Scene, size: tuple[float, float]) -> np.ndarray:
     """A bright disc in a dark square of `size` mm on the scene's screen: (n_x, n_y)."""
     return target_on_screen(picture_of_disc(), size, scene.screen)
+
+
+def project_of_disc(pixels: int, control: int) -> Project:
+    """One in memory whose picture is the bright disc."""
+    full = complete({"screen": {"resolution": [pixels] * 2}, "lens": {"control": [control] * 2}}, 1.0)
+    return Project(None, full, Picture(picture_of_disc(), "linear"))
 
 
 def picture_of_disc() -> np.ndarray:

@@ -304,7 +304,7 @@ def cheapest(
 
 def noise_of(figures: Mapping[str, Any]) -> float:
     """What the judge's own light leaves uncertain of an error, by the figures of a design."""
-    return judge_of(figures).unsure(figures)
+    return figures.get(judge_of(figures).unsure) or 0.0
 
 
 def reached(figures: Mapping[str, Any], error: float, quality: str, say: Reporter) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError, alternatives
-from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES, SIDE_BY_SIDE
+from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES, SIDE_BY_SIDE, WITHIN
 from caustic_cli.export.milling import ROTARY, Milling
 from caustic_cli.export.part import Part, part_of, turned
 from caustic_cli.export.reading import Reading, Readings
@@ -295,7 +295,7 @@ def export(
         )
         return found
     made.refuse_foreign(force)
-    with exporter.say.notify_if_slow(f"{path} takes long: a larger ⟨tolerance⟩, or ⟨scallop⟩ of a tool, takes less"):
+    with exporter.say.notify_if_slow(f"{path} takes long: {LESS[format]}"):
         found = exporter.write(path, format, script, **given)
     more = {"beside": [str(file) for file in written[1:]]} if len(written) > 1 else {}
     figures = {
@@ -320,6 +320,9 @@ def exporter_of(project: Path, at: str | None, say: Reporter, most: float = MOST
     return Exporter(scene, field, heights, target, waves, opened.settings.design.seed, most, say), opened
 
 
+#: How to have a file of a format sooner.
+LESS = dict.fromkeys(FORMATS, "fewer ⟨samples⟩ take less") | dict.fromkeys(WITHIN, "a larger ⟨tolerance⟩ takes less")
+LESS["gcode"] = "a larger ⟨tolerance⟩, or ⟨scallop⟩ of a tool, takes less"
 #: How to have formats of splines exactly.
 EXACT = {"step": "⟨tolerance⟩ 0 writes the exact one", "lighttools": "⟨tolerance⟩ 0 stores exact numbers"}
 
@@ -330,7 +333,7 @@ def accuracy_words(figures: dict) -> str:
         return ""
     nx, ny = figures["samples"]
     noise = "" if not figures["noise"] else f" ± {figures['noise']:.2g}"
-    by = judge_of(figures).words(noise)
+    by = judge_of(figures).after.format(noise=noise)
     if figures["lens_error"] is None:
         judged = f"its image differs from the lens' own by {figures['error']:.2g} (relative RMS, by rays)"
     else:

@@ -86,8 +86,7 @@ def design(
         out: a project directory to keep checkpoints and pictures in; without it, no file is touched.
         force: replace a project there.
         movie: a GIF or MP4 file that shows the image at its iterations.
-        on_progress, on_message: callbacks.
-        device: cpu or cuda.
+        on_progress, on_message: callbacks; device: cpu or cuda.
         given: any other setting, by the name of its option (`resolution=128`, `lens_size=[20, 20]`, `linear=True`, `waves="off"`)
             or by its section and key in project.toml (`lens_z_in=1.0`), see `config.keywords`; `element` and `stages` are lists
             of tables.

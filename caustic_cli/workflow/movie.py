@@ -100,7 +100,7 @@ class Movie(NoMovie):
         self._add(image, f"stage {stage + 1}, {self._last}", f"relative RMS error {self._error(image):.3f}, by {how}")
 
     def finish(self, image: np.ndarray, figures: dict[str, Any], say: Reporter) -> dict[str, str]:
-        words = f"relative RMS error {figures['error']:.3f}, {judge_of(figures).light(figures)}"
+        words = f"relative RMS error {figures['error']:.3f}, {judge_of(figures).light.format(**figures)}"
         self._add(image, f"finished after {self._last}" if self._last else "finished", words)
         self.write()
         say.say(f"{self.path}: {len(self.frames)} frames of the design")

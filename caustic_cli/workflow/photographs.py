@@ -267,22 +267,26 @@ def _named_by(path: Path, color: bool) -> Shot:
     given = settings.toml_of(read_text(path), f"{path}")
     own = {key: given.pop(key, None) for key in ("photo", "marks", "screen_corners", "throw")}
     with naming(path):
-        for key in ("photo", "marks"):
-            if not isinstance(own[key], str) and not (key == "marks" and own[key] is None):
-                raise InputError(f'{key} must name a file, {key} = "wall.{"jpg" if key == "photo" else "csv"}"')
-        corners, throw = own["screen_corners"], own["throw"]
-        if corners is not None and own["marks"] is not None:
-            raise InputError("marks and screen_corners both say where the screen is: leave one out")
-        if corners is not None and not (isinstance(corners, list) and len(corners) == 4 and {*map(type, corners)} == {str}):
-            raise InputError('screen_corners must be four texts "column,row"')
-        if throw is not None and not (type(throw) in (int, float) and 0 < throw < math.inf):
-            raise InputError(f"throw must be greater than 0 mm, got {throw!r}")
+        _check_named(**own)
     scene = settings.checked(given, f"{path}")
     if others := [section for section in scene if section not in TAKEN]:
         raise InputError(f"{path}: [{others[0]}] is not of a photograph, whose sections are {', '.join(f'[{s}]' for s in TAKEN)}")
     flat = {f"{section}.{key}": value for section, table in scene.items() for key, value in table.items()}
     photo, marks = (None if own[key] is None else path.parent / own[key] for key in ("photo", "marks"))
-    return Shot(photo, registration.read_codes(photo, color), marks, corners_of(corners), flat, throw)
+    return Shot(photo, registration.read_codes(photo, color), marks, corners_of(own["screen_corners"]), flat, own["throw"])
+
+
+def _check_named(photo: Any, marks: Any, screen_corners: Any, throw: Any) -> None:
+    for key, name in (("photo", photo), ("marks", "" if marks is None else marks)):
+        if not isinstance(name, str):
+            raise InputError(f'{key} must name a file, {key} = "wall.{"jpg" if key == "photo" else "csv"}"')
+    if screen_corners is not None and marks is not None:
+        raise InputError("marks and screen_corners both say where the screen is: leave one out")
+    types = [type(c) for c in screen_corners] if isinstance(screen_corners, list) else None
+    if screen_corners is not None and types != [str] * 4:
+        raise InputError('screen_corners must be four texts "column,row"')
+    if throw is not None and not (type(throw) in (int, float) and 0 < throw < math.inf):
+        raise InputError(f"throw must be greater than 0 mm, got {throw!r}")
 
 
 def waves_of(lens: Lens, heights: Tensor) -> np.ndarray | None:

@@ -32,8 +32,8 @@ PARTS = (0.7, 1.0, 1.4, 2.0)
 LED, BEFORE, CONE, PIXELS = 2.0, 3.0, 90.0, 100
 
 
-def led() -> Settings:
-    """Settings of the default scene of the study."""
+def led() -> Project:
+    """The default scene of the study, with a bright disc for its picture."""
     full = complete(
         {
             "source": {"type": "disc", "position": [[0.0, 0.0, -BEFORE]], "size": [LED, LED], "cone": CONE},
@@ -41,21 +41,24 @@ def led() -> Settings:
         },
         1.0,
     )
-    return full.changed(target=full.target.changed(file="target.npy", encoding="linear"))
+    full = full.changed(target=full.target.changed(file="target.npy", encoding="linear"))
+    return Project(None, full, Picture(picture_of_disc(), "linear"))
 
 
 def lenses(project: Project | None, seconds: float, device: str) -> tuple[int, Iterator[DesignedLens]]:
     """Largest number of lenses, and an iterator that designs them, each with at most `seconds` of iterations; those whose light
     cannot reach the picture are left out."""
-    full = led() if project is None else project.settings
-    if project is not None and region_of(full.design) is not None:
+    project = project or led()
+    full = project.settings
+    if region_of(full.design) is not None:
         return len(BEAM), _shaped(project, seconds, device)
     near = not settings.build_source(full.source).distant and not full.lens.mirror
     weights, fractions = (NEAR_WEIGHTS, PARTS) if near else (DISTANT_WEIGHTS, (1.0,))
-    return len(weights) * len(fractions), _designed(project, full, weights, fractions, seconds, device)
+    return len(weights) * len(fractions), _designed(project, weights, fractions, seconds, device)
 
 
-def _designed(project: Project | None, full: Settings, weights, fractions, seconds: float, device: str) -> Iterator[DesignedLens]:
+def _designed(project: Project, weights, fractions, seconds: float, device: str) -> Iterator[DesignedLens]:
+    full = project.settings
     for fraction in fractions:
         thickness = full.lens.z_in + fraction * (full.lens.thickness - full.lens.z_in)
         on_rays = [s for s in full.design.stages if not s.waves]
@@ -105,7 +108,7 @@ def _shaped(project: Project, seconds: float, device: str) -> Iterator[DesignedL
         yield DesignedLens(problem.scene.lens.offset.thickness, goal, problem.options.loss, *how)
 
 
-def _prepared(project: Project | None, varied: Settings, device: str) -> PreparedDesign:
+def _prepared(project: Project, varied: Settings, device: str) -> PreparedDesign:
     """The design with these settings, adapted to its initial heights."""
-    project = Project(None, varied, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=varied)
-    return first_heights(project, {"lens": {"thickness": varied.lens.thickness}}, problem_of(project, device))
+    changed = replace(project, settings=varied)
+    return first_heights(changed, {"lens": {"thickness": varied.lens.thickness}}, problem_of(changed, device))

@@ -17,13 +17,22 @@ from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.media import Medium
 from caustic_cli.optics.surfaces import HeightField, Plane, Sphere
 from caustic_cli.optics.system import Element, System
-from caustic_cli.optics.waves.image import Imager, image_of, lines_of, lines_of_system, wave_image
+from caustic_cli.optics.waves.image import Imager, Line, image_of, lines_of, wave_image
 from caustic_cli.optics.waves.unsupported import receiver_of
 from caustic_cli.scene import Aperture, CircularAperture, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 
 GREEN = 550.0
 LAMBDA = 5.5e-4
 DOUBLE = torch.float64
+
+
+def _lines_of(system: System) -> list[Line]:
+    """Spectral lines of a system, source by source."""
+    return [
+        Line(wavelength, fraction * part, system.with_source(source), wavelength)
+        for source, fraction in zip(system.sources, system.fractions, strict=True)
+        for wavelength, part in zip(*system.light.lines(), strict=True)
+    ]
 
 
 def spline_of(field: HeightField, function) -> torch.Tensor:
@@ -127,12 +136,12 @@ def test_airy_pattern_at_a_focus(kind):
     width = LAMBDA / (2.0 * a * power)
     screen = Screen((7 * width, 7 * width), focus, (21, 21))
     system = System((PlaneWave(),), elements, (screen,), Light(wavelengths=(GREEN,)))
-    found = image_of(lines_of_system(system), heights, screen, dtype=DOUBLE)
+    found = image_of(_lines_of(system), heights, screen, dtype=DOUBLE)
     area = math.pi * a * a
     exact = airy(screen, a, a * power, LAMBDA)
     assert np.abs(irradiance(found, screen, area) - exact).max() < 5e-3 * exact.max()
     off = replace(screen, z=focus + 0.5 * LAMBDA / (a * power) ** 2)  # a quarter wave at the edge
-    beside = image_of(lines_of_system(system), heights, off, dtype=DOUBLE)
+    beside = image_of(_lines_of(system), heights, off, dtype=DOUBLE)
     assert 0.70 < float(beside.image.max() / found.image.max()) < 0.90
 
 
@@ -207,8 +216,8 @@ def test_sources_of_a_system_are_watched_where_their_light_goes():
     heights = {"back": spline_of(field, lambda x, y: -(x * x + y * y) / 40.0)}
     points = [Points(((x, 0.0, -30.0),), (power,)) for x, power in ((2.0, 1.0), (-2.0, 3.0))]
     system = System(tuple(points), elements, (screen,), Light(wavelengths=(GREEN,)))
-    found = image_of(lines_of_system(system), heights, screen, dtype=DOUBLE)
-    alone = [image_of(lines_of_system(replace(system, sources=(p,))), heights, screen, dtype=DOUBLE) for p in points]
+    found = image_of(_lines_of(system), heights, screen, dtype=DOUBLE)
+    alone = [image_of(_lines_of(replace(system, sources=(p,))), heights, screen, dtype=DOUBLE) for p in points]
     both = 0.25 * alone[0].image + 0.75 * alone[1].image
     torch.testing.assert_close(found.image, both, rtol=1e-9, atol=1e-12)
     assert found.leaving == pytest.approx(0.25 * alone[0].leaving + 0.75 * alone[1].leaving)
@@ -262,7 +271,7 @@ def test_taylor_of_a_lens(source, losses):
     screen = Screen((3.5, 3.0), 30.0, (12, 12))
     system = System((SOURCES[source],), elements, (screen,), Light(wavelengths=(GREEN,)))
     heights = spline_of(field, lambda x, y: (x * x + y * y) / 90.0 + 2e-3 * torch.cos(2.0 * x) * torch.sin(1.5 * y))
-    *orders, rest = taylor(lines_of_system(system), {"back": heights}, screen)
+    *orders, rest = taylor(_lines_of(system), {"back": heights}, screen)
     assert all(1.9 < o < 2.1 for o in orders) if source == "plane" else all(o > 1.5 for o in orders), (orders, rest)
     assert rest < 1e-2
 
@@ -283,5 +292,5 @@ def test_taylor_of_several_surfaces():
         )
         for k, name in enumerate(("front", "back", "fold"))
     }
-    *orders, rest = taylor(lines_of_system(system), heights, screen)
+    *orders, rest = taylor(_lines_of(system), heights, screen)
     assert all(o > 1.5 for o in orders) and rest < 3e-3, (orders, rest)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 from torch import Tensor
 
@@ -19,11 +19,44 @@ from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Scene
 
-#: A `bounds.Bounds`: a trace takes none, and these are partly found by one.
-Bounds: TypeAlias = Any
-
 #: Fraction of the source's power below which stray light is neglected: the models of other effects are no more accurate.
 NEGLIGIBLE = 0.01
+
+
+@dataclass(frozen=True)
+class ExitBounds:
+    """Bounds over all rays at the exit surface."""
+
+    #: Of the surface.
+    slope: float
+    #: n sin i, below 1 there is no total internal reflection.
+    critical: float
+    #: Slope bound times the tangent of the exit ray's angle, below 1 there is no secondary intersection.
+    slope_ratio: float
+    #: Distance of rays from the axis at the greatest height, in half widths of the aperture.
+    reach: float
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds over all rays; see `optics.bounds`.  Angles in rad, slopes dimensionless, heights in mm."""
+
+    #: Angle of rays to z in front of and behind the entrance.
+    incidence: float
+    inside: float
+    exit: ExitBounds
+    #: Largest over all wavelengths.
+    index: float
+    #: Of the glass, mm.
+    depth: float
+    #: Fraction of the power that is reflected twice inside; estimate of the relative RMS that this light adds to the image, see
+    #: `bounds.ghost_error`.
+    ghost: float
+    ghost_error: float
+    #: For unpolarised light, the change of the exit's reflectance by the polarisation acquired at the entrance.
+    polarised: float
+    #: Limit set by diffraction, source and pixels: a `resolution.Resolution`, which a trace finds.
+    resolution: Any
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ class Intersection(GeneralRayEffect):
         if scene.axial:
             return Decision(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
         angle = math.degrees(b.inside)
-        way = "meet the mirror" if scene.lens.mirror else "cross the lens"
-        return Decision(self.name, True, f"rays {way} at up to {angle:.3g} degrees", angle, 0.0)
+        return Decision(self.name, True, f"rays {scene.lens.interaction.way} at up to {angle:.3g} degrees", angle, 0.0)
 
     def action(self, system, requests: Requests) -> Action | None:
         """The action that uses the mean plane instead, on request."""

@@ -19,10 +19,10 @@ class TotalReflection(Effect):
     def decide(self, scene: Scene, b) -> Decision:
         """By the bound of n sin i."""
         at = b.exit
-        if at.critical < 1.0 and not scene.elements:
-            return Decision(self.name, False, f"n sin i <= {at.critical:.4g} at slopes up to {at.slope:.3g}", at.critical, 1.0)
         if scene.elements:
             return Decision(self.name, True, "total reflection may occur at other lenses", fixed=True)
+        if at.critical < 1.0:
+            return Decision(self.name, False, f"n sin i <= {at.critical:.4g} at slopes up to {at.slope:.3g}", at.critical, 1.0)
         return Decision(self.name, True, f"n sin i may reach {at.critical:.4g} at slopes up to {at.slope:.3g}", at.critical, 1.0)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:

@@ -134,7 +134,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
     continuous = scene.light.continuum is not None
     given, parts = scene.light.lines(wavelengths or ())
     channels = scene.light.channels if given is scene.light.wavelengths else (None,) * len(given)
-    states = (0.0, 90.0) if scene.light.tracked and scene.light.polarisation is None else (scene.light.polarisation,)
+    states = scene.light.states
     of_each = zip(given, parts, channels, scene.light.colours_of(given), strict=True)
     for k, (wavelength, part, channel, colour) in enumerate(of_each):
         lens, label = replace(scene.lens, roughness=0.0), None
@@ -152,16 +152,6 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
                 Line(wavelength, part / len(states), systems[indices, state], label, channel, colour, k % 2 if continuous else None)
             )
     return found
-
-
-def lines_of_system(system: System) -> list[Line]:
-    """Spectral lines of a system, source by source."""
-    given, parts = system.light.lines()
-    return [
-        Line(wavelength, fraction * part, system.with_source(source), wavelength)
-        for source, fraction in zip(system.sources, system.fractions, strict=True)
-        for wavelength, part in zip(given, parts, strict=True)
-    ]
 
 
 def wave_image(

@@ -134,7 +134,7 @@ class MeasuredBeam(Source):
         line = (2.0 * np.arange(POINTS) + 1.0) / POINTS - 1.0
         u, v = np.meshgrid(line, line, indexing="ij")
         light = self.irradiance(u * pupil.half_size[0], v * pupil.half_size[1], pupil)
-        return float(light[pupil.aperture.covers(u, v)].mean() if pupil.aperture.round else light.mean())
+        return float(light[pupil.aperture.covers(u, v)].mean())
 
 
 def _like(x, values: np.ndarray) -> Any:

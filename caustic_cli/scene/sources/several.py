@@ -253,11 +253,7 @@ def light_of(table: Table, unit: str, color: bool = False) -> Light:
     name, detector = table.get("spectrum"), table.get("detector")
     if name is None and wavelengths:
         given = Light(None, wavelengths, weights, color=color, unit=unit)
-        by_eye = not color and (detector or ("power" if unit == "W" else "eye")) == "eye"
-        seen, efficacy = spectra.luminous(wavelengths, weights)
-        if by_eye and not efficacy > 0:
-            raise InputError("⟨source.wavelengths⟩: the eye sees none of them; ⟨+source.detector⟩ power measures their power")
-        return replace(given, weights=seen if by_eye else weights, efficacy=efficacy)
+        return _lines_seen(given, detector or ("power" if unit == "W" else "eye"))
     if name is None and detector is None:
         return Light(None, wavelengths, weights, unit=unit)
     if weights:
@@ -267,6 +263,15 @@ def light_of(table: Table, unit: str, color: bool = False) -> Light:
         return Light(unit=unit, measure=measure)
     at, parts = Light(measure=measure).lines(wavelengths) if wavelengths else measure.rule(RAY_NODES)
     return Light(None, at, parts, unit=unit, measure=measure, efficacy=spectra.luminous_efficacy(measure.spectrum))
+
+
+def _lines_seen(light: Light, detector: str) -> Light:
+    """Light of spectral lines as a detector weights it."""
+    by_eye = detector == "eye" and not light.color
+    seen, efficacy = spectra.luminous(light.wavelengths, light.weights)
+    if by_eye and not efficacy > 0:
+        raise InputError("⟨source.wavelengths⟩: the eye sees none of them; ⟨+source.detector⟩ power measures their power")
+    return replace(light, weights=seen if by_eye else light.weights, efficacy=efficacy)
 
 
 def light_of_all(section: Table, color: bool = False) -> Light:

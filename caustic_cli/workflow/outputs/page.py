@@ -66,7 +66,7 @@ class InteractivePage(Output):
         return {"page": str(self.html)}
 
 
-def _size(values: tuple[float, float], unit: str = " mm") -> str:
+def _size(values: tuple[float, ...], unit: str = " mm") -> str:
     return " × ".join(f"{v:.6g}" for v in values) + unit
 
 
@@ -78,7 +78,7 @@ def _lens_rows(lens: Lens) -> list[tuple[str, str]]:
     z, slope = grid.z[inside], np.hypot(grid.zx, grid.zy)[inside]
     depth = ("Depth of the surface", f"{z.max() - z.min():.4f} mm from its lowest to its highest point")
     steepest = ("Steepest slope", f"{slope.max():.4f}, {math.degrees(math.atan(slope.max())):.2f}°")
-    size = f"round, {_size(one.size[:1])} across" if one.opening.round else _size(one.size)
+    size = one.opening.words(_size)
     if one.mirror:
         return [("Mirror", f"{size}; the side towards the light reflects"), depth, steepest]
     flat = one.entrance is None
@@ -124,9 +124,8 @@ def _notes(plan: Plan) -> list[str]:
     notes = [f"Not traced on this page: {'; '.join(missing)}."] if missing else []
     if plan.scene.colored:
         notes.append("The picture is coloured; this page shows the light of all its colours together.")
-    side = "from the mirror’s side" if plan.scene.lens.mirror else "from behind, as through a translucent one"
     notes.append(
-        f"Pictures show the screen {side}:"
+        f"Pictures show the screen {plan.scene.lens.interaction.seen_from}:"
         " x to the right, y upwards. Light that leans along x"
         f" travels towards +x. Made by caustic {__version__}."
     )
