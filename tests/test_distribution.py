@@ -144,6 +144,7 @@ def test_the_first_surface_knows_the_table():
         (b"0 1 2\n10 1\n", "line 1 is '0 1 2'"),
         (b"angle,intensity\nangle,intensity\n0,1\n", "line 2"),
         (b"0,1\nten,1\n", "line 2 is 'ten,1'"),
+        (b"0,x\n10,1\n", "line 1 is '0,x'"),
         (b"", "has no angles"),
         (b"\xff\xfe\x00", "is not text"),
         (b"0 1\n" * 100_001, "more than 100,000 angles"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -207,12 +207,7 @@ def _export_lamp(asked: ExportOptions, path: Path) -> None:
 
     options.refuse_others(asked, ("format", "output", "samples", "milling"))
     samples = tuple(options.both(options.counts("--samples", asked.samples))) if asked.samples else None
-    if asked.format is None:
-        formats = [lamp_formats.format_of("" if asked.output is None else asked.output.suffix)]
-    else:
-        formats = [name.strip() for name in asked.format.split(",")]
-    if asked.output and len(formats) > 1:
-        raise InputError("--out names one file; several formats are written beside each other under the project's own name")
+    formats = _names(asked, lambda: lamp_formats.format_of("" if asked.output is None else asked.output.suffix))
     for name in formats:
         lamp_formats.check_export(name, samples)
     project, found = Project.open(path), []
@@ -224,18 +219,21 @@ def _export_lamp(asked: ExportOptions, path: Path) -> None:
         console.emit_json(found[0] if len(formats) == 1 else {"exports": found})
 
 
+def _names(asked: ExportOptions, default: Callable[[], str]) -> list[str]:
+    """Names of the formats that are asked for."""
+    names = [default()] if asked.format is None else [name.strip() for name in asked.format.split(",")]
+    if asked.output and len(names) > 1:
+        raise InputError("--out names one file; several formats are written beside each other under the project's own name")
+    return names
+
+
 def _formats(asked: ExportOptions) -> list[str]:
     """Names of the formats.
 
     Raises:
         InputError: one is unknown, or the output does not fit it.
     """
-    if asked.format is None and asked.output:
-        formats = [format_of(asked.output)]
-    else:
-        formats = [name.strip() for name in (asked.format or "lighttools").split(",")]
-    if asked.output and len(formats) > 1:
-        raise InputError("--out names one file; several formats are written beside each other under the project's own name")
+    formats = _names(asked, lambda: format_of(asked.output) if asked.output else "lighttools")
     for name in formats:
         format_of(asked.output, name)
     return formats

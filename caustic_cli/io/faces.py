@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.io import columns
 from caustic_cli.io.files import naming
 from caustic_cli.io.surfaces import MAX_STEP_BYTES, SPLINE, spline_in, step_text
 from caustic_cli.optics.system import freeform_of
@@ -83,10 +84,7 @@ def _triple(text: str, kind: str, number: str) -> np.ndarray:
 
 
 def _number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+    value = columns.number(text)
+    if value is None or not math.isfinite(value):
         raise InputError(f"{text.strip()!r} is no number")
     return value

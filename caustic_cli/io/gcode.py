@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.io import columns
 from caustic_cli.io.files import naming, open_regular
 
 ACCEPTED = "a program of G0 and G1 moves is needed"
@@ -149,10 +150,7 @@ def read_program(path: str | Path) -> Program:
 
 
 def _real(text: str, number: int) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+    value = columns.number(text)
+    if value is None or not math.isfinite(value):
         raise InputError(f"line {number}: {text!r} is no number; {ACCEPTED}")
     return value

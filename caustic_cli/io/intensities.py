@@ -4,12 +4,13 @@ file that is symmetric about its axis."""
 from __future__ import annotations
 
 import math
-import re
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from caustic_cli.errors import InputError
+from caustic_cli.io.columns import rows_of
+from caustic_cli.io.files import naming
 from caustic_cli.io.photometry import SUFFIXES, Photometry, parse_photometry
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 
@@ -49,54 +50,22 @@ def _mean(light: Photometry, where: str) -> Distribution:
             f"{where}: its planes C differ by {off:.0%} of the peak, and the intensity of a source depends on the angle to its axis"
             " alone; a file that is symmetric about the axis is needed"
         )
-    try:
+    with naming(where):
         return Distribution(tuple(light.angles.tolist()), tuple(values.clip(0.0).tolist()))
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
 def _table(data: bytes, where: str) -> Distribution:
-    """Parse text: a header line is optional; columns are separated by commas, semicolons or blanks; # begins a
-    comment.
+    """Parse text, see `columns`.
 
     Raises:
         InputError: naming `where` and the line.
     """
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{where}: is not text; {TABLE}") from error
     rows: list[tuple[float, float]] = []
-    named = False
-    for number, line in enumerate(lines, 1):
-        cells = [c for c in re.split(r"[,;\s]+", line.partition("#")[0].strip(), maxsplit=2) if c]
-        if not cells:
-            continue
-        row = _numbers(cells)
-        if row is None and not rows and not named and not any(map(_number, cells)):
-            named = True
-            continue
-        if row is None:
-            raise InputError(f"{where}: line {number} is {line.strip()!r}; {TABLE}")
-        rows.append(row)
-        if len(rows) > MOST_ANGLES:
-            raise InputError(f"{where}: has more than {MOST_ANGLES:,} angles; {TABLE}")
+    for angle, intensity, line in rows_of(data, where, TABLE, "angles", MOST_ANGLES):
+        if not (math.isfinite(angle) and math.isfinite(intensity)):
+            raise InputError(f"{line}; {TABLE}")
+        rows.append((angle, intensity))
     if not rows:
         raise InputError(f"{where}: has no angles; {TABLE}")
-    try:
+    with naming(where):
         return Distribution(*(tuple(column) for column in zip(*rows, strict=True)))
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
-
-
-def _numbers(cells: list[str]) -> tuple[float, float] | None:
-    values = [_number(c) for c in cells]
-    return None if len(values) != 2 or None in values else (values[0], values[1])
-
-
-def _number(cell: str) -> float | None:
-    try:
-        value = float(cell)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None

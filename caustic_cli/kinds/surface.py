@@ -34,12 +34,7 @@ from caustic_cli.inverse.objective import LossOfHeights, Objective, SourceBlur
 from caustic_cli.inverse.projection import BeamProjection
 from caustic_cli.inverse.reachability import refuse_unreachable
 from caustic_cli.inverse.sharpness import advice
-from caustic_cli.inverse.source_limits import (
-    SourceLimits,
-    best_irradiance,
-    performance_limits,
-    source_spread,
-)
+from caustic_cli.inverse.source_limits import SourceLimits, best_irradiance, performance_limits, source_spread
 from caustic_cli.inverse.target import grey
 from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.evaluation import Evaluated, LensEvaluation

@@ -12,7 +12,7 @@ import numpy as np
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
-from caustic_cli.scene.sources.plane import PlaneWave, direction
+from caustic_cli.scene.sources.plane import PlaneWave, direction, picture_of
 from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.section import (
     SourceType,
@@ -64,12 +64,7 @@ class Disc(Source):
         if self.angle is not None:
             check("source.angle", self.angle)
         if self.brightness is not None:
-            light = np.asarray(self.brightness, dtype=float)
-            with np.errstate(over="ignore"):
-                total = light.sum()
-            if light.ndim != 2 or not np.isfinite(light).all() or (light < 0).any() or not 0 < total < np.inf:
-                raise InputError("⟨source.file⟩ of a disc must be a 2-D picture, finite, not negative, and not black all over")
-            object.__setattr__(self, "brightness", light)
+            object.__setattr__(self, "brightness", picture_of(self.brightness, "⟨source.file⟩ of a disc"))
             if self.distant and self.frame[0] * self._reach[2] >= 1.0:
                 raise InputError(f"⟨source.angle⟩ of {self.angle:g} degrees is too wide for a picture whose corners lie beyond it")
         if self.distant:
