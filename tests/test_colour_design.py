@@ -113,7 +113,7 @@ def test_wavelengths_that_mix_no_picture_are_refused(picture, capfd, wavelengths
 def test_pictures_without_colours_are_refused(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = run(capfd, "design", "disc", "--color", *TINY, code=2)
-    assert "--color needs the file of a picture" in said and len(said.splitlines()) == 1
+    assert "disc: has no colours" in said and len(said.splitlines()) == 1
 
 
 @pytest.mark.parametrize("wavelengths", [RGB, LASERS, REDDISH])

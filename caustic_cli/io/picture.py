@@ -156,6 +156,8 @@ def read_picture(path: str | Path | Piped, linear: bool = False, color: bool = F
         InputError: the picture cannot be read, or is too large, too small, black, negative or not finite.
     """
     if str(path) in NAMED and not Path(path).exists():
+        if color:
+            raise InputError(f"{path}: has no colours; the file of a picture is needed")
         return Picture(NAMED[f"{path}"](), "linear")
     if isinstance(path, Piped):
         array = path.startswith(NPY_MAGIC)

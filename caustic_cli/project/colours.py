@@ -52,7 +52,7 @@ def completed(given: Given, goal: TargetSettings, picture: Picture) -> Given:
     if not goal.color:
         return given
     if picture.values.ndim < 3:
-        raise InputError("⟨target.color⟩ needs the file of a picture: one by name, or an array (n_x, n_y), has no colours")
+        raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
     return {**given, "source": filled(given.get("source", {}), picture)}
 
 

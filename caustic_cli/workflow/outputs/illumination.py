@@ -14,6 +14,7 @@ from caustic_cli.inverse.lenslets import lenslets
 from caustic_cli.io.picture import read_picture, write_image
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.project import colours
 from caustic_cli.scene import Scene
 from caustic_cli.scene.traits import Capability
 from caustic_cli.studies.brightness import brightness
@@ -52,7 +53,7 @@ class Illumination(Output):
         assert project is not None
         goal = project.settings.target
         light = read_picture(self.want, goal.encoding == "linear", goal.color).irradiance()
-        self.target = project.of_picture(light, goal.size, scene.screen, scene.light)
+        self.target = colours.on_screen(light, scene.light, goal.size, scene.screen, goal.flip)
 
     def write(self, rendering: Rendering) -> dict[str, Any]:
         """Solve for the brightnesses and write the resulting image.
