@@ -60,6 +60,7 @@ SLOW = (
     "test_movie.py",
     "test_others.py",
     "test_page.py",
+    "test_page_rays.py",
     "test_picture_network.py",
     "test_project.py",
     "test_ranks.py",

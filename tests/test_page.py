@@ -9,18 +9,16 @@ import subprocess
 import zlib
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from helpers import write_blob
-from rayfiles import cone_of, tm25
 from test_direction import heights
 from test_direction import scene as at_angle
 
 from caustic_cli import cli, load
-from caustic_cli.export.page import MOST, PAGE, _coded, _lights, _onto, write_page
+from caustic_cli.export.page import MOST, _coded, _lights, _onto, write_page
 from caustic_cli.io.colorimetry import _into_gamut, rgb_matrix
 from caustic_cli.io.files import is_ours
 from caustic_cli.optics.emission import rays_of
@@ -193,18 +191,6 @@ def test_the_same_again_is_no_work_and_others_files_stay(home, monkeypatch, capf
     (home / "mine.html").write_text("<p>mine</p>")
     assert cli.run(["render", "plane.caustic", "--rays", "1e5", *RAYS, "--html", "mine.html"]) == 2
     assert "was not made by caustic" in capfd.readouterr().err and (home / "mine.html").read_text() == "<p>mine</p>"
-
-
-def test_rays_of_a_file_are_refused(home, monkeypatch, capfd):
-    monkeypatch.chdir(home)
-    Path("led.tm25ray").write_bytes(tm25(*cone_of(2000, 0.05)))
-    light = ["--source", "rays", "--source-file", "led.tm25ray", "--source-position", "0,0,-60"]
-    assert cli.run(["render", "point.caustic", *light, "--html", "rays.html", "-o", "rays.png"]) == 2
-    assert "not the rays of a file" in capfd.readouterr().err and not Path("rays.html").exists() and not Path("rays.png").exists()
-    scene = load(home / "point.caustic").scene
-    assert PAGE.supports(scene)
-    rays = replace(scene, source=SimpleNamespace(rays=1, members=(1,), nearest=-60.0, axis=(0.0, 0.0, 1.0)))
-    assert "plane waves, points, grids and discs" in PAGE.why_not(rays)
 
 
 def test_light_with_a_spectrum_is_in_colour(tmp_path, monkeypatch):
@@ -417,7 +403,7 @@ def test_sources_of_which_one_has_no_colour_are_shown_in_grey():
     source = together((PlaneWave(1.0), PlaneWave(1.0)), [light_of_all(one) for one in tables])
     scene = Scene(source, lens, Screen((12.0, 12.0), 60.0, (24, 24)), light_of_all(tables[0] | {"also": tables[1:]}))
     assert scene.white is None and any(band.colour for band in scene.bands)
-    assert all(colour is None for light in _lights(scene) for _, _, colour in light["indices"])
+    assert all(colour is None for light in _lights(scene, {}) for _, _, colour in light["indices"])
 
 
 #: Control points of a net of 2 x 2 lenslets like that of one.

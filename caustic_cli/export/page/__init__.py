@@ -4,7 +4,8 @@ screen.
 The page holds heights and slopes of the free-form surfaces, and of a curved screen over its tangent plane, on regular grids, and
 traces rays in the browser, offline.  Values are quantised to 16 bits between the least and the largest: one quantum of a slope
 displaces light by 1/65,535 of the range of all slopes, far less than a pixel.  Light that has more before its screen than one lens
-of one index is held as rays (`traced`): the screen moves on such a page, the light does not.
+of one index is held as rays (`traced`), and that of a ray file as points with an intensity each (`light_field`): the screen moves
+on such a page, the light does not.
 
 Notation
     c[i, j]     codes, i along +x and j along +y; stored as their differences along both axes, modulo 2^16, for compression
@@ -19,7 +20,7 @@ import html
 import json
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import resources
 from operator import mul
@@ -30,7 +31,10 @@ import torch
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.export.page.light_field import MOST as MOST_POINTS
+from caustic_cli.export.page.light_field import FieldPoint, LightField, light_fields
 from caustic_cli.export.page.traced import ITSELF, traced_lights
+from caustic_cli.export.page.traced import MOST as MOST_HELD
 from caustic_cli.export.surface import SurfaceGrid, sample_grid
 from caustic_cli.io.colorimetry import rgb_matrix
 from caustic_cli.io.files import CREATED_BY, write_bytes
@@ -80,12 +84,7 @@ TRACED = frozenset(
 )
 #: Additive quasi-random sequence R2 in the unit square, powers of the inverse plastic number (Roberts 2018).
 EVEN = (0.7548776662466927, 0.5698402909980532)
-PAGE = Capability.because(
-    "interactive page",
-    {"so few of them as a page holds leave a grainy picture": ("ray file", "ray file among sources")},
-    "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file, since {reason}; ⟨source.type⟩ renders it"
-    " under another light",
-)
+PAGE = Capability("interactive page", {})
 
 
 def write_page(
@@ -113,17 +112,18 @@ def write_page(
         encoding: of displayed images, srgb or linear.
 
     Raises:
-        InputError: the page does not support the scene, see PAGE, or the file cannot be written.
+        InputError: the file cannot be written, or no ray of a ray file meets the lens.
     """
-    PAGE.refuse(scene)
     scene = scene.unfolded
     moves = ITSELF.supports(scene)
+    fields = light_fields(scene, MOST_POINTS if moves else MOST_HELD)
     screen, kind = _coarser(scene.screen), scene.lens.kind
     data = {
         "title": title,
         "lens": _lens(scene.lens),
         "screen": _screen(replace(scene, screen=screen)),
-        "lights": _lights(scene) if moves else [],
+        "lights": _lights(scene, fields) if moves else [],
+        "still": bool(fields) or not moves,
         "encoding": encoding,
         "target": None if target is None else _coded(_onto(target, screen)),
         "waves": None if waves is None else _coded(_onto(waves, screen)),
@@ -134,13 +134,13 @@ def write_page(
         "kind": kind,
         "Kind": kind.capitalize(),
         "rows": _table(rows),
-        "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes),
+        "notes": "".join(f"<p>{html.escape(note)}</p>" for note in (*notes, *(of.words for of in fields.values()))),
     }
     fronts = sum(_length(light["front"]) for light in data["lights"] if light.get("front"))
     for cells in CELLS if moves else FEWER:
         cloud = _cloud(scene, field, heights, cells)
         if not moves:
-            data["lights"] = [_held(scene, field, heights, tuple(cloud["exit"]["z"]["shape"]))]
+            data["lights"] = [_held(scene, field, heights, tuple(cloud["exit"]["z"]["shape"]), fields)]
             fronts = sum(map(_length, data["lights"][0]["rays"]))
         if _length(cloud) + fronts <= MOST_CLOUD:
             break
@@ -273,9 +273,9 @@ def _primaries(scene: Scene, xyz: np.ndarray) -> np.ndarray:
     return np.tensordot(rgb_matrix(scene.white), xyz, 1)
 
 
-def _lights(scene: Scene) -> list[dict]:
-    """The sources: fraction of the total power of each, and its refractive indices, each with its weight and, where the colour
-    differs, linear R, G, B by its power."""
+def _lights(scene: Scene, fields: Mapping[int, LightField]) -> list[dict]:
+    """The sources, and the points of ray files: fraction of the total power of each, and its refractive indices, each with its
+    weight and, where the colour differs, linear R, G, B by its power."""
     lights = []
     for k, one in enumerate(scene.by_source):
         bands = [band for band in scene.bands if band.member in (None, k)]
@@ -287,22 +287,28 @@ def _lights(scene: Scene) -> list[dict]:
             colours = [band.colour for band in same if band.colour is not None and scene.white is not None]
             mean = _primaries(scene, weights @ np.array(colours) / weights.sum()).tolist() if colours else None
             indices[index] = (weights.sum() / total, mean)
-        lights.append(
-            {
-                "weight": scene.source.fractions[k],
-                "indices": [[index, *of] for index, of in indices.items()],
-                **_source(one, one.source, round(FRONT / math.sqrt(len(scene.by_source)))),
-            }
-        )
+        points = round(FRONT / math.sqrt(len(scene.by_source)))
+        shared = {"indices": [[index, *of] for index, of in indices.items()]}
+        for part, light in map(_point, fields[k].points) if k in fields else [(1.0, _source(one, one.source, points))]:
+            lights.append({"weight": scene.source.fractions[k] * part, **shared, **light})
     return lights
 
 
-def _held(scene: Scene, field: HeightField, heights: Tensor, counts: tuple[int, int]) -> dict:
+def _point(point: FieldPoint) -> tuple[float, dict]:
+    """A point of a ray file, as a fraction of its power and a near source of uniform intensity whose irradiance is uneven."""
+    even = float(point.intensity.mean())
+    x, y, z = point.position
+    light = {"extent": [0.0, 0.0], "picture": None, "chord": 2.0, "cut": False, "intensity": [even / point.part] * 2}
+    front = _surface(point.intensity / even, *np.zeros((2, *point.intensity.shape)))
+    return point.part, {"near": True, "places": [[x, y, z - point.pupil.z, 1.0]], **light, "front": front}
+
+
+def _held(scene: Scene, field: HeightField, heights: Tensor, counts: tuple[int, int], fields: Mapping[int, LightField]) -> dict:
     """All light as rays behind the last surface, see `traced`, as a source that the page takes to its screen."""
     pupil, lens = scene.pupil.half_size, scene.lens.half_size
     more = math.prod(pupil) / math.prod(lens)  # power per area of the lens' rectangle, over which the page has the grid
     rays = []
-    for one in traced_lights(scene, field, heights, counts):
+    for one in traced_lights(scene, field, heights, counts, fields):
         colour = one.band.colour
         rays.append(
             {

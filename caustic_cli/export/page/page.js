@@ -201,14 +201,14 @@ function entranceOf(cloud) {
   return (beam, x, y, z, ray) => {
     const front = fronts.get(beam.light);
     const { n, near, x0, y0, h } = beam, z0 = lens.zIn - h, t = z - lens.zIn;
-    let ax = beam.ax, ay = beam.ay, az = near ? 1 : Math.sqrt(1 - ax * ax - ay * ay), away = 0; // 1 / distance from the source
+    let ax = beam.ax, ay = beam.ay, az = near ? 1 : Math.sqrt(1 - ax * ax - ay * ay), away = 0; // 1 / distance from the source, negative before a focus
     let ex = near ? (x * h + x0 * (t / n)) / (h + t / n) : x - (t * ax) / Math.sqrt(n * n - ax * ax - ay * ay);
     let ey = near ? (y * h + y0 * (t / n)) / (h + t / n) : y - (t * ay) / Math.sqrt(n * n - ax * ax - ay * ay);
     for (let step = 0; ; step++) {
       surface(ex, ey, ray);
       if (near) {
         ax = ex - x0; ay = ey - y0; az = ray.s - z0;
-        away = 1 / Math.sqrt(ax * ax + ay * ay + az * az);
+        away = Math.sign(h) / Math.sqrt(ax * ax + ay * ay + az * az);
         ax *= away; ay *= away; az *= away;
       } else if (front) {
         front(ex, ey, wave);
@@ -223,7 +223,7 @@ function entranceOf(cloud) {
       let hxx = away * (1 + sx * sx - au * au) + n * r * (1 + sx * sx - du * du) + gz * ray.sxx;
       let hyy = away * (1 + sy * sy - av * av) + n * r * (1 + sy * sy - dv * dv) + gz * ray.syy;
       let hxy = away * (sx * sy - au * av) + n * r * (sx * sy - du * dv) + gz * ray.sxy;
-      if (front) { hxx += wave.sxx; hyy += wave.syy; hxy += wave.sxy; }
+      if (front && !near) { hxx += wave.sxx; hyy += wave.syy; hxy += wave.sxy; }
       const det = hxx * hyy - hxy * hxy, mx = (hyy * gx - hxy * gy) / det, my = (hxx * gy - hxy * gx) / det;
       ex -= mx; ey -= my;
       if (mx * mx + my * my < FINE * FINE) step = STEPS - 1;
@@ -398,7 +398,7 @@ void enter(vec3 to, out vec3 d, out vec2 e, out vec2 q, out float w, out float l
   vec3 p = vec3(zIn, 0.0, 0.0), bend = vec3(0.0), curl = vec3(0.0);
   for (int step = 0; ; step++) {
     if (bent) p = onGrid(entrance, radius, e, bend);
-    if (near) { vec2 side = e - origin.xy; float up = p.x - zIn + h; away = inversesqrt(dot(side, side) + up * up); a = vec3(side, up) * away; }
+    if (near) { vec2 side = e - origin.xy; float up = p.x - zIn + h; away = sign(h) * inversesqrt(dot(side, side) + up * up); a = vec3(side, up) * away; }
     else if (uneven) { a.xy = direction + onGrid(front, radius, e, curl).yz; a.z = sqrt(1.0 - dot(a.xy, a.xy)); }
     if (n == 1.0 || step == 6) break;
     vec3 way = to - vec3(e, p.x); float r = inversesqrt(dot(way, way)); way *= r;
@@ -412,7 +412,8 @@ void enter(vec3 to, out vec3 d, out vec2 e, out vec2 q, out float w, out float l
   glass = (to.z - p.x) / d.z;
   if (!bent) e = to.xy - glass * d.xy; // from the exit: differences of near numbers
   q = e + (zIn - p.x) / a.z * a.xy;
-  w = near ? intensity(a) * a.z * (a.z / h) * (a.z / h) : uneven ? onGrid(front, radius, q, curl).x : 1.0;
+  w = near ? intensity(a) * a.z * (a.z / h) * (a.z / h) : 1.0;
+  if (uneven) w *= onGrid(front, radius, q, curl).x;
   lost = fresnel > 0 && n > 1.0 ? reflectance(c / sqrt(norm2), root / (n * sqrt(norm2)), 1.0 / n) : 0.0;
 }
 bool meet(vec3 from, vec3 o, out vec2 landing) {
@@ -540,10 +541,9 @@ function graphicsTracer(cloud, slowToo) {
         gl.uniform3f(where.origin, beam.x0, beam.y0, beam.h); gl.uniform3f(where.axis, ...beam.axis);
         gl.uniform1i(where.cut, beam.light.cut); gl.uniform1f(where.chord, beam.light.chord);
         gl.activeTexture(gl.TEXTURE1); gl.bindTexture(gl.TEXTURE_2D, tables[held.lights.indexOf(beam.light)]);
-      } else {
-        gl.uniform2f(where.direction, beam.ax, beam.ay); gl.uniform1i(where.uneven, Boolean(beam.light.grid));
-        gl.activeTexture(gl.TEXTURE5); gl.bindTexture(gl.TEXTURE_2D, fronts[held.lights.indexOf(beam.light)]);
-      }
+      } else gl.uniform2f(where.direction, beam.ax, beam.ay);
+      gl.uniform1i(where.uneven, Boolean(beam.light.grid));
+      gl.activeTexture(gl.TEXTURE5); gl.bindTexture(gl.TEXTURE_2D, fronts[held.lights.indexOf(beam.light)]);
       gl.drawArrays(gl.POINTS, 0, ((cloud.nx - 1) / thin) * ((cloud.ny - 1) / thin));
       gl.flush();
       yield;
@@ -734,14 +734,14 @@ function solidView(canvas, cloud) {
 
 /** What the screen's place, the light's lean and the source's size are where the lens was designed, and how far each may go. */
 function ranges() {
-  const { screen, lights } = held, first = lights[0], still = Boolean(first.rays), sign = screen.z < 0 ? -1 : 1;
+  const { screen, lights } = held, first = lights[0], { still } = held, sign = screen.z < 0 ? -1 : 1;
   const far = Math.abs(screen.z - held.lens.zIn), across = Math.max(...screen.resolution.map((m, k) => m * screen.pixel[k]));
   const own = 2 * Math.max(...first.extent), at = first.near ? Math.abs(first.places[0][2]) : 1;
   const size = first.near ? own : (2 * Math.asin(own / 2) * 180) / Math.PI;
   const wide = ((0.15 * across) / far) * (first.near ? at : 180 / Math.PI); // blurs 15 % of the screen
   return {
     sign,
-    throw: screen.focal ? null : { value: sign * screen.z, min: Math.max(0.3 * sign * screen.z, still ? sign * first.rays[0].z + 1 : 0), max: 2 * sign * screen.z, unit: "mm" },
+    throw: screen.focal ? null : { value: sign * screen.z, min: Math.max(0.3 * sign * screen.z, first.rays ? sign * first.rays[0].z + 1 : 0), max: 2 * sign * screen.z, unit: "mm" },
     leanx: still ? null : { value: 0, min: -15, max: 15, unit: "°" },
     leany: still ? null : { value: 0, min: -15, max: 15, unit: "°" },
     size: still ? null : { value: size, min: 0, max: Math.max(2 * size, wide), unit: first.near ? "mm" : "°" },

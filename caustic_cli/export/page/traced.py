@@ -8,7 +8,7 @@ those of the axis in front of the screen.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from caustic_cli.export.page.light_field import FieldPoint, LightField
 from caustic_cli.optics.emission.coherent import Mode, central_mode, modes
 from caustic_cli.optics.frames import AxisSegment, to_local
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -49,22 +50,24 @@ class TracedLight:
     grids: dict[str, np.ndarray]
 
 
-def points_of(scene: Scene) -> list[tuple[Band, Mode, float]]:
-    """Points of all sources at all indices, each with its part of the power."""
-    found = []
+def points_of(scene: Scene, fields: Mapping[int, LightField]) -> list[tuple[Band, Mode | FieldPoint, float]]:
+    """Points of all sources at all indices, each with its part of the power; fields: of ray files, by the places of sources."""
+    found: list[tuple[Band, Mode | FieldPoint, float]] = []
     for band in scene.bands:
-        lit = System.of(band.scene)
-        each = modes(lit, EACH) if band.scene.source.extended else [central_mode(lit)]
+        lit, measured = System.of(band.scene), fields.get(band.member or 0)
+        each = measured.points if measured else modes(lit, EACH) if band.scene.source.extended else [central_mode(lit)]
         found += [(band, mode, band.weight) for mode in each[:: -(-len(each) // MOST)]]
     return found
 
 
-def traced_lights(scene: Scene, field: HeightField, heights: Tensor, counts: tuple[int, int]) -> Iterator[TracedLight]:
-    """The light of every point through a grid of (n, m) points over the pupil, borders included."""
+def traced_lights(
+    scene: Scene, field: HeightField, heights: Tensor, counts: tuple[int, int], fields: Mapping[int, LightField]
+) -> Iterator[TracedLight]:
+    """The light of every point, as of `points_of`, through a grid of (n, m) points over the pupil, borders included."""
     u, v = (
         c.reshape(-1) for c in torch.meshgrid(*(torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in counts), indexing="ij")
     )
-    for band, mode, weight in points_of(scene):
+    for band, mode, weight in points_of(scene, fields):
         system = System.of(band.scene, field)
         masks = [e.aperture for e in system.elements if e.name == EXIT and e.aperture.masks]
         clear = tuple(replace(e, aperture=system.pupil.aperture) if e.aperture in masks else e for e in system.elements)

@@ -64,7 +64,7 @@ class MeasuredRays:
     def _drawn(self) -> tuple[Tensor, ...]:
         """Points of the pupil x, y, mm, directions, and fractions of the source's power: (N,) each."""
         source, pupil = _of_file(self.scene.source), self.scene.pupil
-        x, y, met, part = _meeting(source, pupil)
+        x, y, met, part = meeting(source, pupil)
         if self.rays < len(met):
             (rx, ry), chosen = pupil.half_size, random_numbers(self.seed, 0, torch.zeros(1, dtype=torch.int64))
             order = np.argsort(_morton(0.5 + 0.5 * x / rx, 0.5 + 0.5 * y / ry), kind="stable")
@@ -94,7 +94,7 @@ def _of_file(source: Source) -> Measured:
     return cast(Measured, source)
 
 
-def _meeting(source: Measured, pupil: Pupil) -> tuple[np.ndarray, ...]:
+def meeting(source: Measured, pupil: Pupil) -> tuple[np.ndarray, ...]:
     """Rays through a pupil: points x and y, mm, indices in the file, and fractions of the power."""
     x, y, met = source.crossing(pupil)
     (met,) = np.nonzero(met)
@@ -104,6 +104,11 @@ def _meeting(source: Measured, pupil: Pupil) -> tuple[np.ndarray, ...]:
             " ⟨source_position⟩ moves them"
         )
     return x[met], y[met], met, source.rays.flux[met] / source.rays.flux.sum()
+
+
+def effective_count(part: np.ndarray) -> float:
+    """Number of rays of equal power that have the noise of rays of these powers."""
+    return float(part.sum()) ** 2 / float((part * part).sum())
 
 
 def _morton(u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -121,9 +126,8 @@ def coarseness(scene: Scene) -> tuple[float, int] | None:
     if scene.source.rays is None:
         return None
     source, lens = _of_file(scene.source), scene.lens
-    *_, part = _meeting(source, lens.pupil)
-    equal = float(part.sum()) ** 2 / float((part * part).sum())  # effective number of rays of equal power
-    noise = math.sqrt(math.prod(scene.screen.resolution) / equal)
+    *_, part = meeting(source, lens.pupil)
+    noise = math.sqrt(math.prod(scene.screen.resolution) / effective_count(part))
     return noise, math.ceil(source.rays.count * (noise / WORTHY) ** 2)
 
 
@@ -155,7 +159,7 @@ def irradiance(scene: Scene, x: np.ndarray, y: np.ndarray, height: float) -> np.
     if scene.source.rays is None:
         return None
     source, lens = _of_file(scene.source), scene.lens
-    at_x, at_y, met, part = _meeting(source, lens.pupil)
+    at_x, at_y, met, part = meeting(source, lens.pupil)
     d, n = source.turned.directions[met], lens.inside
     inside = np.sqrt(1.0 - (d[:, 0] ** 2 + d[:, 1] ** 2) / (n * n))
     if lens.interior.fresnel != "none":
