@@ -116,8 +116,8 @@ def write_page(
     """
     scene = scene.unfolded
     moves = ITSELF.supports(scene)
-    fields = light_fields(scene, MOST_POINTS if moves else MOST_HELD)
     screen, kind = _coarser(scene.screen), scene.lens.kind
+    fields = light_fields(replace(scene, screen=screen), MOST_POINTS if moves else MOST_HELD)
     data = {
         "title": title,
         "lens": _lens(scene.lens),
