@@ -140,7 +140,8 @@ def write_page(
     for cells in CELLS if moves else FEWER:
         cloud = _cloud(scene, field, heights, cells)
         if not moves:
-            data["lights"] = [_held(scene, field, heights, tuple(cloud["exit"]["z"]["shape"]), fields)]
+            room = MOST_CLOUD - _length(cloud) if cells > FEWER[-1] else MOST
+            data["lights"] = [_held(scene, field, heights, tuple(cloud["exit"]["z"]["shape"]), fields, room)]
             fronts = sum(map(_length, data["lights"][0]["rays"]))
         if _length(cloud) + fronts <= MOST_CLOUD:
             break
@@ -303,8 +304,11 @@ def _point(point: FieldPoint) -> tuple[float, dict]:
     return point.part, {"near": True, "places": [[x, y, z - point.pupil.z, 1.0]], **light, "front": front}
 
 
-def _held(scene: Scene, field: HeightField, heights: Tensor, counts: tuple[int, int], fields: Mapping[int, LightField]) -> dict:
-    """All light as rays behind the last surface, see `traced`, as a source that the page takes to its screen."""
+def _held(
+    scene: Scene, field: HeightField, heights: Tensor, counts: tuple[int, int], fields: Mapping[int, LightField], room: int
+) -> dict:
+    """All light as rays behind the last surface, see `traced`, as a source that the page takes to its screen; or as much of it as
+    is more than `room`, bytes."""
     pupil, lens = scene.pupil.half_size, scene.lens.half_size
     more = math.prod(pupil) / math.prod(lens)  # power per area of the lens' rectangle, over which the page has the grid
     rays = []
@@ -319,6 +323,9 @@ def _held(scene: Scene, field: HeightField, heights: Tensor, counts: tuple[int, 
                 **{name: _coded(grid) for name, grid in one.grids.items()},
             }
         )
+        room -= _length(rays[-1])
+        if room < 0:
+            break
     still = {"near": False, "places": [[0.0, 0.0, 0.0, 1.0]], "extent": [0.0, 0.0], "axis": [0.0, 0.0, 1.0], "indices": []}
     return {"weight": 1.0, **still, "rays": rays}
 
