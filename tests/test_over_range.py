@@ -141,6 +141,7 @@ SCENES = {
         Ranges((Range("source.z", -80.0, -40.0), Range("source.x", -2.0, 4.0))),
         {"type": "point", "position": [[1.0, 0.0, -60.0]]},
     ),
+    "tilted": (THROWS, {"type": "plane", "tilt": [10.0, 4.0]}),
 }
 
 
@@ -172,15 +173,20 @@ def test_gradients_of_the_mean_loss_pass_the_taylor_test(case):
     assert rest[2] < rest[0]
 
 
-def test_the_loss_is_the_mean_over_lenses_in_their_own_scenes():
-    """Each, made from nothing, says what the moved objective says."""
-    made = designer(*SCENES["source"])
+@pytest.mark.parametrize("case", ["source", "tilted"])
+def test_the_loss_is_the_mean_over_lenses_in_their_own_scenes(case):
+    """Each, made from nothing, says what the moved objective says; the screen of tilted light stays on it."""
+    made = designer(*SCENES[case])
     adam = stepped(made)
     objective, z = adam.over, adam._objective_here()[0].detach()
     e, found = objective(z, 0), []
     for k, (row, heights) in enumerate(zip(objective.values(0).tolist(), z, strict=True)):
         scene = objective.ranges.scene(made.scene, row)
-        assert scene.source.positions[0] == pytest.approx((row[1], 0.0, row[0]), abs=1e-12)
+        if case == "source":
+            assert scene.source.positions[0] == pytest.approx((row[1], 0.0, row[0]), abs=1e-12)
+        else:
+            x, y, z = scene.source.axis
+            assert scene.screen.shift == pytest.approx((row[0] * x / z, row[0] * y / z), rel=1e-12)
         fresh = made.problem.on_rays(scene, 0, made.field(0), made.problem.target, 3000)
         fresh = fresh.moved(scene, objective.at(0)[k].samplers[0])
         found.append(fresh(heights))

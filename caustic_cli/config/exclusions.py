@@ -74,12 +74,6 @@ EXCLUDED: dict[str, dict[str, str]] = {
         "source.also": "⟨source.each⟩ needs one [[source]], of which there is one behind every lenslet",
         "design.waves on": "{said} is not for ⟨source.each⟩: the light of every source has an image behind the whole array",
     },
-    "source.tilt": {
-        **dict.fromkeys(
-            ("element", "design.over"),
-            "⟨source.tilt⟩ cannot be combined with ⟨{path}⟩, whose light is along the axis",
-        ),
-    },
     "design.over": {"design.robust": "⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already"},
 }
 #: Feature -> settings of which it needs one -> message.

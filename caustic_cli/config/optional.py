@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
-from caustic_cli.config.settings import FIRST, Settings, build_source
+from caustic_cli.config.settings import FIRST, Settings, build_component, build_source
 from caustic_cli.errors import InputError, alternatives
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.loading import OnDemand
-from caustic_cli.scene import sources
+from caustic_cli.scene import Lens, Offset, Scene, Screen, Source, sources
 from caustic_cli.scene.interaction import interaction_of
 from caustic_cli.scene.traits import TRAITS
 from caustic_cli.schema.table import (
@@ -30,11 +30,13 @@ from caustic_cli.schema.table import (
 )
 
 rooms, sunlights = OnDemand("caustic_cli.scene.room"), OnDemand("caustic_cli.scene.sunlight")
-room_screens = OnDemand("caustic_cli.scene.room_screen")
+room_screens, lens_space = OnDemand("caustic_cli.scene.room_screen"), OnDemand("caustic_cli.inverse.lens_space")
 
 #: Decimals of the angles that follow from a time, degrees, and how far a project's own may be from them.
 ANGLE_DECIMALS, SAME_ANGLE = 4, 0.01
 OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
+#: Size of elements and thickness of a lens that one ray passes, mm.
+POINT, THIN = (1e-3, 1e-3), 1e-3
 BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
 
 
@@ -121,8 +123,8 @@ def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping
     if by.screen_place is None or s.screen.far:
         if not source.lean or s.second is not None:
             return s.screen
-        x, y, z = (abs(s.screen.z) / source.axis[2] * c for c in source.axis)
-        return s.screen.filled(tilt=[interaction.side * angle + 0.0 for angle in source.tilt], shift=[x + 0.0, y + 0.0])
+        (x, y), tilt = _among(s, source, s.elements, s.screen.z) if s.elements else _straight_on(s, source)
+        return s.screen.filled(tilt=tilt, shift=[0.0, 0.0] if s.screen.far else [x, y])
     twice = ["⟨throw⟩"] * (by.throw is not None) + [f"⟨screen.{key}⟩" for key in ("z", "tilt", "shift") if key in given]
     if twice or s.elements:
         why = f"{twice[0]} would be another" if twice else "⟨element⟩ has the screen on its own axis"
@@ -131,6 +133,30 @@ def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping
     pane = rooms.Room() if room is None else rooms.Room(room.faces, room.slope)
     place = room_screens.placed(by.screen_place, pane, interaction.sent((x, y, z)), interaction.side)
     return s.screen.changed(z=place.z, tilt=place.tilt, shift=place.shift)
+
+
+def _straight_on(s: Settings, source: Source) -> tuple[tuple[float, float], list[float]]:
+    """Where light along a source's axis through the middle of the lens meets the plane of the screen if no surface has slopes, mm
+    from the axis, and the tilt of a screen square to it, degrees."""
+    x, y, _ = (abs(s.screen.z) / source.axis[2] * c + 0.0 for c in source.axis)
+    return (x, y), [interaction_of(s.lens.mirror).side * angle + 0.0 for angle in source.tilt]
+
+
+def _among(s: Settings, source: Source, elements: Sequence[ElementSettings], z: float) -> tuple[tuple[float, float], list[float]]:
+    """The same through other elements, at a distance z along the folded axis, mm.
+
+    Raises:
+        InputError: an element is invalid, or the light does not arrive.
+    """
+    beside = [element.changed(size=list(POINT)) for element in elements]
+    scene = Scene(
+        source,
+        Lens(s.lens.size, s.lens.z_in, offset=Offset(s.lens.z_in + THIN)),
+        Screen(s.lens.size, z),
+        elements=tuple(build_component(element, s.lens.wavelength) for element in beside),
+    )
+    place, direction = lens_space.undeviated_ray(scene)
+    return place, [round(angle, ANGLE_DECIMALS) for angle in rooms.tilt_of(direction)]
 
 
 def middle_distance(over: Ranges, z: float, side: float, given: bool) -> float:
@@ -208,14 +234,17 @@ def complete_second_size(s: Settings) -> SecondSettings | None:
 
 def complete_elements(s: Settings) -> tuple[ElementSettings, ...]:
     """Other lenses and mirrors with their default sizes, and checks of unsupported combinations."""
-    return tuple(_complete_element(element, s) for element in s.elements)
+    source = build_source(s.source)
+    return tuple(_complete_element(element, s, source, s.elements[:k]) for k, element in enumerate(s.elements))
 
 
-def _complete_element(element: ElementSettings, s: Settings) -> ElementSettings:
-    if "z" not in element:
+def _complete_element(element: ElementSettings, s: Settings, source: Source, before: Sequence[ElementSettings]) -> ElementSettings:
+    if "z" not in element or "size" in element:
         return element
     along = min(1.0, max(0.0, check("element.z", element.z) / abs(s.screen.z)))
     size = [BEAM * (a + (b - a) * along) if along else a for a, b in zip(s.lens.size, s.target.size, strict=True)]
+    if along and source.lean:  # the light leaves the axis, on which the element stands
+        size = [w + 2.0 * abs(c) for w, c in zip(size, _among(s, source, before, element.z)[0], strict=True)]
     lean = [math.cos(math.radians(t)) for t in check("element.tilt", element.tilt or (0.0, 0.0))]
     size = [w / c for w, c in zip(size, lean[::-1], strict=True)]
-    return element.filled(size=[max(size)] * 2 if element.aperture == "circle" else size)
+    return element.changed(size=[max(size)] * 2 if element.aperture == "circle" else size)

@@ -501,11 +501,11 @@ def build_scene(settings: Settings) -> Scene:
         build_screen(settings.screen),
         build_light(settings),
         build_second(settings),
-        tuple(_component(element, settings.lens.wavelength) for element in settings.elements),
+        tuple(build_component(element, settings.lens.wavelength) for element in settings.elements),
     )
 
 
-def _component(element: ElementSettings, wavelength: float) -> Component:
+def build_component(element: ElementSettings, wavelength: float) -> Component:
     """The lens or mirror of an [[element]] table, whose size must be given."""
     kind = check("element.type", element.get("type", "lens"))
     for key in ("z", "size"):

@@ -20,6 +20,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,6 +54,8 @@ STEEPEST = 0.6
 TRACED_STEPS, FOUND = 12, 1e-7
 #: What rounding may add to the distance from the axis of a ray at the edge of an aperture, as a part of it.
 ROUNDED = 1e-9
+#: What makes a lens one of air.
+AIR: dict[str, Any] = {"index": 1.0 + 1e-9, "glass": None, "gradient": None, "fresnel": "none", "entrance": None}
 #: Corners that are traced at a time, for their memory.
 CORNERS = 1 << 17
 #: A point and two beside it, along x and y, in the steps of finite differences.
@@ -83,8 +86,7 @@ def is_traced(scene: Scene) -> bool:
 
 def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray | None = None) -> tuple[np.ndarray, tuple | None]:
     """The same in air at heights z of the entrance, mm; None for its plane."""
-    bare = {"index": 1.0 + 1e-9, "glass": None, "gradient": None, "fresnel": "none", "entrance": None}
-    air = replace(scene, lens=replace(scene.lens, **bare), second_target=None)
+    air = replace(scene, lens=replace(scene.lens, **AIR), second_target=None)
     return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in) if z is None else z)
 
 
@@ -269,7 +271,7 @@ def lit_rectangle(
     lens, source = scene.lens, scene.source
     whole, middle = (scene, (0.0, 0.0)) if array is None else array
     low, high = [-r for r in lens.half_size], list(lens.half_size)
-    if not source.oblique:
+    if not source.oblique or scene.in_front:  # behind other lenses `incident` finds what is dark
         return (low[0], low[1]), (high[0], high[1])
     lines = [np.linspace(-r, r, EDGE) for r in lens.half_size]
     for axis, slope in enumerate(slopes_inside(source.axis, lens.inside)):

@@ -186,7 +186,7 @@ class _Grid:
     def projection(self, mean: float) -> Projection | None:
         """Projection of the screen for a surface of this mean height; None for an upright plane screen without a crossing."""
         scene, lens = self.scene, self.scene.lens
-        found = RelayedScreen(scene, mean) if scene.behind else projection_of(scene, mean)
+        found = RelayedScreen(self.whole, mean, self.middle) if scene.behind else projection_of(scene, mean)
         if not lens.crossing:
             return found
         return CrossedProjection(found or ScreenProjection(scene.screen, mean, lens.interaction.side), found is None)

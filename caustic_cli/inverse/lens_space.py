@@ -8,9 +8,13 @@ of a symplectic map, and so never singular.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.incidence import AIR, directions
 from caustic_cli.inverse.relay import UNSEEN, RelayedScreen, trace_through
 from caustic_cli.optics.frames import AxisSegment
 from caustic_cli.optics.system import System
@@ -49,6 +53,27 @@ def lines_behind(scene: Scene, points: np.ndarray, slopes: np.ndarray) -> tuple[
     ahead = scene.screen.z - vertex
     lines = np.stack([*(found[:2] + ahead * found[2:]), np.full(found.shape[1], scene.screen.z)])
     return lines.reshape(points.shape), found[2:].reshape(slopes.shape)
+
+
+def undeviated_ray(scene: Scene) -> tuple[tuple[float, float], tuple[float, float, float]]:
+    """Where light of the source's centre through the middle of the lens, which does not deviate it, meets the plane at the screen's
+    z of the folded axis, mm, and its direction there, of any length.
+
+    Raises:
+        InputError: it does not arrive.
+    """
+    vertex = scene.lens.z_in
+    found = directions(replace(scene, lens=replace(scene.lens, **AIR)), np.array([[0.0], [0.0], [vertex]]))[0]
+    x, y = (AIR["index"] * float(c) for c in found[:2, 0])
+    along = math.sqrt(1.0 - x * x - y * y)
+    p, q, ahead = x / along, y / along, scene.screen.z - vertex
+    if not scene.behind:
+        return (ahead * p, ahead * q), (p, q, 1.0)
+    leaving, system = np.array([0.0, 0.0, p, q])[:, None, None], RelayedScreen(scene, vertex).system
+    at_x, at_y, p, q = (float(c) for c in _arriving(system, vertex, leaving, np.full(1, scene.screen.z)).ravel())
+    if not math.isfinite(at_x + at_y + p + q):
+        raise InputError(UNSEEN)
+    return (at_x, at_y), (p, q, 1.0)
 
 
 def _arriving(system: System, vertex: float, leaving: np.ndarray, z: np.ndarray) -> np.ndarray:

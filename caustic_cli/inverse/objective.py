@@ -229,7 +229,7 @@ class Objective:
         """The same objective for another position of screen or source and other rays, sharing the filtered target."""
         other = copy.copy(self)
         channel = copy.copy(self.channels[0])
-        channel.screen = replace(channel.screen, z=scene.screen.z)
+        channel.screen = replace(channel.screen, z=scene.screen.z, shift=scene.screen.shift)
         other.scene, other.channels, other.samplers = scene, [channel], [rays]
         other.kept = None if self.kept is None else list(other._tracers())
         return other

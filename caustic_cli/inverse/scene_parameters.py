@@ -1,6 +1,7 @@
 """Scene parameters over whose ranges a network is trained, which takes them as inputs (thesis 2.5.2 and 7.2).
 
-    throw                            distance of the screen from the lens' origin, mm (of a mirror, before it)
+    throw                            distance of the screen from the lens' origin along the axis, mm (of a mirror, before it); in
+                                     tilted light the screen moves along it
     source.x, source.y, source.z     position of a point source, or of the centre of a grid of points, mm
 
 Each varies over a range.  These are the independent parameters of eq. 2.5.8, and the network is the map from them to the lens:
@@ -140,8 +141,9 @@ class Ranges:
         """
         at = dict(zip(self.keys, values, strict=True))
         if "throw" in at:
-            z = scene.lens.interaction.side * at["throw"]
-            scene = replace(scene, screen=replace(scene.screen, z=z))
+            z, screen, light = scene.lens.interaction.side * at["throw"], scene.screen, scene.undeviated
+            x, y = (c + (z - screen.z) * d / light[2] for c, d in zip(screen.shift, light, strict=False))
+            scene = replace(scene, screen=replace(screen, z=z, shift=(x, y)))
         if any(key.startswith("source.") for key in at):
             source = scene.source
             self.refuse(source)

@@ -33,6 +33,7 @@ from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.objective import LossOfHeights, Objective, SourceBlur
 from caustic_cli.inverse.projection import BeamProjection
 from caustic_cli.inverse.reachability import refuse_unreachable
+from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.sharpness import advice
 from caustic_cli.inverse.source_limits import SourceLimits, best_irradiance, performance_limits, source_spread
 from caustic_cli.inverse.target import grey
@@ -338,7 +339,9 @@ class OneSurface(OnWaves):
         x, y = (c.numpy() for c in self.field(0).control_xy())
         vertex, index = lens.offset.thickness, lens.effective_index
         slope = [c / ((index - 1.0) * (screen.z - vertex)) for c in screen.shift]
-        if source.lean:
+        if self.scene.behind:
+            slope = RelayedScreen(self.scene, vertex).lean(index)
+        elif source.lean:
             slope = BeamProjection(screen, vertex, lens.interaction.side, source.axis).lean(index)
         return torch.from_numpy(lens.offset.heights(x, y) + slope[0] * x[:, None] + slope[1] * y[None, :])
 

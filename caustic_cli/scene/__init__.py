@@ -108,10 +108,8 @@ class Scene:
 
     @property
     def undeviated(self) -> Vector:
-        """Unit direction, in the frame of the screen, of light along the source's axis behind a surface without slopes."""
-        if self.elements:
-            return 0.0, 0.0, float(self.lens.interaction.side)
-        return self.lens.interaction.sent(self.source.axis)
+        """Unit direction, in the frame of the screen, of light along the source's axis behind surfaces without slopes."""
+        return reduce(lambda d, element: element.sent(d), self.elements, self.lens.interaction.sent(self.source.axis))
 
     def _check_elements(self) -> None:
         if self.elements:

@@ -22,7 +22,7 @@ from caustic_cli.scene.aperture import Aperture, Pupil, aperture_of, larger
 from caustic_cli.scene.freeform import FreeForm, SecondTarget
 from caustic_cli.scene.interaction import Reflecting, Refracting
 from caustic_cli.scene.materials import nearest_index
-from caustic_cli.scene.screen import Screen, Window, tilted
+from caustic_cli.scene.screen import Screen, Vector, Window, tilted
 from caustic_cli.scene.traits import Capability
 from caustic_cli.schema.table import check, default
 
@@ -156,6 +156,10 @@ class Component:
         """Least thickness of its glass without designed surfaces, mm; infinite without glass."""
         return self.thickness + min(0.0, self.sag("back") - self.sag("front"))
 
+    def sent(self, d: Vector) -> Vector:
+        """Direction along the axes behind it, undeviated by refraction, of light along those in front of it."""
+        return d
+
     def axis_behind(self, leg: Any) -> Any:
         """The segment of the axis (`optics.frames.AxisSegment`) behind it, from that in front of it."""
         return leg
@@ -221,6 +225,11 @@ class FoldMirror(Component):
     def axis_behind(self, leg: Any) -> Any:
         """Folded."""
         return leg.folded(self.z, self.tilt)
+
+    def sent(self, d: Vector) -> Vector:
+        """As of a component: the axis in the plane of the fold is reversed."""
+        about_x, about_y = map(bool, self.tilt)
+        return (-d[0] if about_y else d[0]) + 0.0, (-d[1] if about_x else d[1]) + 0.0, d[2]
 
     @property
     def flat(self) -> bool:
