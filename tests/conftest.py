@@ -48,6 +48,7 @@ SLOW = (
     "test_extended.py",
     "test_extending.py",
     "test_finish_models.py",
+    "test_free_elements.py",
     "test_guide.py",
     "test_intersection.py",
     "test_irradiance.py",
@@ -78,6 +79,7 @@ SLOW = (
     "test_scale.py",
     "test_stages.py",
     "test_system.py",
+    "test_tilted_elements.py",
     "test_tolerances.py",
     "test_turning.py",
     "test_two_setups.py",
@@ -94,6 +96,8 @@ def pytest_sessionstart(session):
 #: Tests of five to forty seconds each, together four minutes on two cores, that run with --long: of what seldom changes or
 #: is tested elsewhere in smaller pieces.
 LONG = (
+    "test_an_index_is_designed_with_all_surfaces",
+    "test_free_elements.py::test_a_coloured_picture",
     "faults/test_kill.py",
     "test_a_design_killed_before_its_first_checkpoint_is_begun_anew[index]",
     *(f"test_four_iterations_are_two_and_two_bitwise[{name}" for name in ("tilted]", "extended source]")),

@@ -675,7 +675,6 @@ def test_an_archive_holds_the_glass_of_every_lens(tmp_path):
     [
         (("--mirror",), "--mirror cannot be combined with --element"),
         (("--element", "lens z=60 free=front", "--collimate"), "--collimate"),
-        (("--element", "lens z=60 free=front", "--network", "sparse"), "--network sparse cannot be combined with [[element]] free"),
     ],
 )
 def test_what_other_elements_exclude_is_named_as_it_was_given(_here, capfd, options, words):

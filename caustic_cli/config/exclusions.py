@@ -60,10 +60,6 @@ EXCLUDED: dict[str, dict[str, str]] = {
         "source.spectrum": "⟨source.spectrum⟩ is not for a coloured picture, whose three wavelengths are its colours",
     },
     **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
-    "element.free": dict.fromkeys(
-        ("lens.gradient free", "design.network", "design.optimizer", "target.color", "design.waves on"),
-        "{said} cannot be combined with ⟨element.free⟩: it is not implemented beside other free surfaces",
-    ),
     "lens.gradient free": {
         "lens.mirror": "⟨lens.gradient⟩ free needs a lens: light never enters a mirror",
         "lens.array": "⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat",

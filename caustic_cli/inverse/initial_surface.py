@@ -112,8 +112,12 @@ class _Grid:
             return whole
         size = 2.0 * float(self.x[-1]), 2.0 * float(self.y[-1])
         lens = replace(whole.lens, size=size, aperture=Aperture.name, outline=None)  # what is dark of it is so in `incident`
-        (sx, sy) = whole.screen.shift
-        return replace(whole, lens=lens, screen=replace(whole.screen, shift=(sx - mx, sy - my)))
+        screen = (
+            whole.screen
+            if whole.screen.far
+            else replace(whole.screen, shift=(whole.screen.shift[0] - mx, whole.screen.shift[1] - my))
+        )
+        return replace(whole, lens=lens, screen=screen)
 
     @property
     def places(self) -> tuple[np.ndarray, np.ndarray]:

@@ -70,7 +70,7 @@ class Mixture:
         gradients = {name: found[0].gradients[EXIT].new_zeros(value.shape) for name, value in parameters.items()}
         for member, e in zip(self.members, found, strict=True):
             weight = member.weight * (e.loss / loss) ** (self.power - 1.0) if loss > 0 else 0.0
-            gradients[EXIT][member.where] += weight * (e.gradients[EXIT] if further else e.gradient)
+            gradients[EXIT][member.where] += weight * e.gradients[EXIT]
             for name in further:
                 gradients[name] += weight * e.gradients[name]
         on_screen = sum(member.seen * e.on_screen for member, e in zip(self.members, found, strict=True))

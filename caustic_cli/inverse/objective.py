@@ -64,7 +64,7 @@ class Evaluation:
     @property
     def gradient(self) -> Tensor:
         """Gradient of the exit (n, m), or of all surfaces, (k, n, m)."""
-        return torch.stack([*self.gradients.values()]) if len(self.gradients) > 1 else self.gradients[EXIT]
+        return self.gradients[EXIT]
 
 
 class LossOfHeights(Protocol):
@@ -257,10 +257,11 @@ class Objective:
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """`evaluate` at the heights (n, m) mm float64 of the exit, or of all surfaces that are `shaped`, (k, n, m)."""
-        return self.evaluate({EXIT: heights} if heights.ndim == 2 else dict(zip(self.scene.free_surfaces, heights, strict=True)))
+        return self.evaluate({EXIT: heights})
 
     def evaluate(self, parameters: Parameters) -> Evaluation:
-        """Value and gradients at heights {name of a surface: (n, m) mm float64}.
+        """Value and gradients at parameters of the trace, of which EXIT are the heights of the exit, (n, m) mm float64, or those of
+        all free surfaces, (k, n, m).
 
         The loss depends on the rays through images and sums alone.  So these are accumulated chunk by chunk, the loss is
         differentiated with respect to them, and each chunk is traced again for the vector-Jacobian product: memory does not grow
@@ -279,7 +280,7 @@ class Objective:
             self.chunk, self.kept = smaller_chunk(self.chunk, problem), None
 
     def _evaluate(self, given: Parameters) -> Evaluation:
-        parameters = {name: heights.detach().to(self.device).clone() for name, heights in given.items()}
+        parameters = {name: heights.detach().to(self.device).clone() for name, heights in self._by_surface(given).items()}
         for heights in parameters.values():
             ranks.broadcast(heights)
             heights.requires_grad_()
@@ -300,7 +301,16 @@ class Objective:
             _add(gradients, more)
         _add(gradients, direct)
         inner = self.channels[0].inner(seen[0].detach())
-        return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()), inner)
+        by_name = dict(zip(parameters, gradients, strict=True))
+        if len(parameters) > len(given):
+            by_name[EXIT] = torch.stack([by_name[name] for name in self.scene.free_surfaces])
+        return Evaluation(float(loss.detach()), {name: by_name[name] for name in given}, float(inner.sum()), inner)
+
+    def _by_surface(self, given: Parameters) -> dict[str, Tensor]:
+        """The parameters with the heights of every free surface by its name, where EXIT has those of all."""
+        heights = given.get(EXIT)
+        several = heights is not None and heights.ndim > 2
+        return {**given, **(dict(zip(self.scene.free_surfaces, cast(Tensor, heights), strict=True)) if several else {})}
 
     def _sums(self, parameters: Parameters) -> tuple[list[Tensor], Tensor, list[tuple[int, list[Tensor] | None]]]:
         """Accumulated contributions of all chunks, see `_see`, images with an axis of source points in front; the power that

@@ -16,6 +16,8 @@ from caustic_cli.kinds.surface import Described, OneSurface
 #: All kinds beside a single surface, each with the setting or section without which it does not apply and is not loaded; a design
 #: is of the first that applies.
 KINDS = (
+    ("element.free", "robust.RobustGradedElements"),
+    ("element.free", "gradient_index.GradedElements"),
     ("lens.with_surface", "robust.RobustGradedLens"),
     ("lens.with_surface", "gradient_index.GradedLens"),
     ("lens.gradient", "robust.RobustPlate"),

@@ -10,7 +10,6 @@ from torch import Tensor
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import departure_bound, sphere_net
-from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.several_surfaces import SeveralSurfaces
 from caustic_cli.kinds.surface import OneSurface
 from caustic_cli.optics.resolution import Resolution
@@ -55,15 +54,6 @@ class FreeElements(SeveralSurfaces, AmongElements):
     @classmethod
     def applies(cls, s: Settings) -> bool:
         return any(element.free != "none" for element in s.elements)
-
-    @classmethod
-    def refuse_settings(cls, d: Defaults) -> None:
-        super().refuse_settings(d)
-        if d.design.start != "transport":
-            raise InputError(
-                f"⟨design.start⟩ of several free surfaces must be transport, got {d.design['start']}; a small net or several points"
-                " have no such start"
-            )
 
     @property
     def half_sizes(self) -> list[tuple[float, float]]:

@@ -111,9 +111,7 @@ class LensEvaluation:
             return Seen(exposure, None, figures)
         problem = self.problem
         light, more = by_waves.wave_figures(
-            problem.scene,
-            self.field,
-            heights.to(problem.device),
+            *trace_arguments(problem.scene, self.field, heights.to(problem.device)),
             self.target,
             self.seen,
             wavelengths=wavelengths,
@@ -124,8 +122,8 @@ class LensEvaluation:
     def add_beam(self) -> None:
         """Add the figures of a shaped beam, where the loss is that of one."""
         problem, seen = self.problem, self.light or self.exposure
-        how = problem.scene, self.field, self.state.heights, problem.target.numpy(), problem.stages[-1].rendering.bright
-        self.figures |= beams.shaped_figures(*how, seen)
+        lens = trace_arguments(problem.scene, self.field, self.state.heights)
+        self.figures |= beams.shaped_figures(*lens, problem.target.numpy(), problem.stages[-1].rendering.bright, seen)
 
     @property
     def start_by_waves(self) -> float:
@@ -184,8 +182,8 @@ class LensEvaluation:
     def add_unseen(self) -> None:
         """Add the error of the wave image at wavelengths that were not refined."""
         if self.light is not None:
-            heights = self.state.heights.to(self.problem.device)
-            self.figures |= by_waves.unseen_figures(self.problem.scene, self.field, heights, self.target)
+            lens = trace_arguments(self.problem.scene, self.field, self.state.heights.to(self.problem.device))
+            self.figures |= by_waves.unseen_figures(*lens, self.target)
 
     def result(self) -> Evaluated:
         """The result."""

@@ -32,7 +32,7 @@ from caustic_cli.inverse.gradient_index import index_of_plate, layers_along, sha
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.objective import LossOfLens
 from caustic_cli.kinds.defaults import Defaults
-from caustic_cli.kinds.elements import AmongElements
+from caustic_cli.kinds.elements import AmongElements, FreeElements
 from caustic_cli.kinds.surface import Described
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics import ranks
@@ -287,3 +287,11 @@ class GradedLens(IndexPlate):
     def words(self, lens: LensSettings) -> str:
         control = self.stages[-1].control
         return f"{super().words(lens)}; exit: {control[0]} x {control[1]} control points"
+
+
+class GradedElements(GradedLens, FreeElements):
+    """A lens whose index and exit are designed together with surfaces of other elements."""
+
+    @classmethod
+    def applies(cls, s: Settings) -> bool:
+        return IndexPlate.applies(s) and FreeElements.applies(s)

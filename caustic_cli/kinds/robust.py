@@ -12,7 +12,7 @@ from caustic_cli.inverse.graded_lens import INDEX
 from caustic_cli.inverse.objective import Evaluation, LossOfHeights, LossOfLens
 from caustic_cli.inverse.robust import robust_objective
 from caustic_cli.kinds.elements import AmongElements, FreeElements
-from caustic_cli.kinds.gradient_index import GradedLens, IndexPlate
+from caustic_cli.kinds.gradient_index import GradedElements, GradedLens, IndexPlate
 from caustic_cli.kinds.lenslet_array import LensletArray
 from caustic_cli.kinds.surface import Described, OneSurface
 from caustic_cli.kinds.two_sided import TwoSides, TwoSidesAmongElements
@@ -102,3 +102,7 @@ class RobustPlate(RobustSurface, IndexPlate):
 
 class RobustGradedLens(RobustPlate, GradedLens):
     """Index and exit, robust."""
+
+
+class RobustGradedElements(RobustPlate, GradedElements):
+    """Index, exit and surfaces of other elements, robust."""

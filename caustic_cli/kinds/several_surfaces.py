@@ -1,4 +1,7 @@
-"""Several free-form surfaces that are designed together: heights are (k, n, m), in the order of `Scene.free_surfaces`."""
+"""Several free-form surfaces that are designed together: heights are (k, n, m), in the order of `Scene.free_surfaces`.
+
+On rays all of them are refined, on the wave image the exit alone, beside the others as they are: the field is that on the exit.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from caustic_cli.inverse.mixture import Member, Mixture
+from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.kinds.surface import OneSurface
+from caustic_cli.optics.system import split_heights
+from caustic_cli.scene import Scene, Screen
 
 
 class SeveralSurfaces(OneSurface):
     """Several free-form surfaces."""
-
-    refines_waves = False
 
     @property
     def half_sizes(self) -> list[tuple[float, float]]:
@@ -35,3 +40,31 @@ class SeveralSurfaces(OneSurface):
 
     def preview(self, heights: Tensor, size: int) -> Iterator[str]:
         yield from ()
+
+    def takes_waves(self, scene: Scene, k: int, initial: Tensor) -> bool:
+        """As of one surface: stages on rays are not left out, by which alone the others are refined."""
+        return False
+
+    def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
+        if self.stages[k].waves:
+            return self.exit_on_waves(self.lit(scene, k), k, initial)
+        return super().objective_in(scene, k, initial)
+
+    def exit_on_waves(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
+        """The loss of the exit alone on the wave images of all pictures, beside the other surfaces as they are.
+
+        Raises:
+            Skipped, NoWaveImage: as of `on_waves`.
+        """
+        beside, exit = split_heights(scene, self.field(k), initial)
+        seen = self.pictures(beside)
+        part = 1.0 / len(seen)
+        members = [
+            Member(self.on_waves(beside.onto(screen), k, exit, target), part, part, float(not n), where=(-1,))
+            for n, (screen, target) in enumerate(seen)
+        ]
+        return Mixture(members, 2.0)
+
+    def pictures(self, scene: Scene) -> list[tuple[Screen, Tensor]]:
+        """The screens of a scene and the target on each."""
+        return [(scene.screen, self.target)]

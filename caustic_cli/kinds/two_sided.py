@@ -18,7 +18,6 @@ from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.initial_surface import InitialSurface
 from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.internal_rays import entrance_points
-from caustic_cli.inverse.mixture import Member, Mixture
 from caustic_cli.inverse.objective import LossOfHeights
 from caustic_cli.inverse.parametrisation import Heights, SidesTogether
 from caustic_cli.inverse.target import grey
@@ -34,7 +33,7 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, Screen
 from caustic_cli.schema.table import LensSettings, ScreenSettings, check, default
 from caustic_cli.studies.judge import judged
 from caustic_cli.studies.retrace import retrace
@@ -59,7 +58,7 @@ class TwoSides(SeveralSurfaces):
         second_target: (k_x, k_y) irradiance on the scene's second screen, or (3, k_x, k_y) in colour, where it has one.
     """
 
-    adapts, refines_waves = False, True
+    adapts = False
 
     def __init__(self, *args: Any, second_target: Tensor | None = None, **more: Any):
         self.second_target = second_target
@@ -123,30 +122,18 @@ class TwoSides(SeveralSurfaces):
         return SidesTogether(*self.bounds(k), start, laplacian, light)
 
     def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
+        if self.stages[k].waves:
+            return super().objective_in(scene, k, initial)
         stage, o, scene = self.stages[k], self.options, self.lit(scene, k)
-        if stage.waves:
-            return self.exit_on_waves(scene, k, initial)
         targets = (self.target,) if self.second_target is None else (self.target, self.second_target)
         rays = rays_of(scene, stage.sampler, stage.rays, self.seed(k), self.device)
         found = TwoSidedObjective(scene, self.field(k), rays, targets, o.loss, stage.rendering, limits=o.limits, dtype=o.dtype)
         return found if k == 0 or len(targets) == 1 else found.balanced(initial)
 
-    def exit_on_waves(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:
-        """The loss of the exit alone on the wave images of both pictures, behind the entrance as it is.
-
-        Raises:
-            Skipped, NoWaveImage: as of `on_waves`.
-        """
-        behind, exit = split_heights(scene, self.field(k), initial)
-        seen = [(behind.screen, self.target)]
-        if self.second_target is not None and scene.second_target is not None and scene.second_target.screen is not None:
-            seen.append((scene.second_target.screen, self.second_target))
-        part = 1.0 / len(seen)
-        members = [
-            Member(self.on_waves(behind.onto(screen), k, exit, target), part, part, float(not n), where=(1,))
-            for n, (screen, target) in enumerate(seen)
-        ]
-        return Mixture(members, 2.0)
+    def pictures(self, scene: Scene) -> list[tuple[Screen, Tensor]]:
+        farther = None if scene.second_target is None else scene.second_target.screen
+        second = [] if farther is None or self.second_target is None else [(farther, self.second_target)]
+        return super().pictures(scene) + second
 
     def seen_by_waves(
         self, field: HeightField, heights: Tensor, size: tuple[float, float], required: bool = True
