@@ -540,17 +540,66 @@ def test_project_keeps_its_face(tube, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "more",
+    [
+        ["--mirror"],
+        ["--gradient", "axial", "--gradient-terms", "0.01"],
+        ["--array", "2x2"],
+        ["--gradient", "free", "--with-surface", "--index-control", "24"],
+    ],
+    ids=lambda more: more[0],
+)
+def test_a_face_is_the_base_of_whatever_has_one(more, tmp_path, monkeypatch):
+    """The same lens by the cylinder of a file as by its radii, which are exactly those."""
+    monkeypatch.chdir(tmp_path)
+    step_file(tmp_path)
+    write_blob(tmp_path / "blob.png")
+    how = ["--throw", "300", "--control", 25, "--resolution", 24, "--iterations", 2, "--waves", "off", *more]
+    for name, base in (("a", ["--base-file", "face.step"]), ("b", ["--base-radius=-30,inf"])):
+        assert run("design", "blob.png", *how, *base, "--out", name) == 0
+    a, b = (load(name) for name in "ab")
+    assert a.heights.numpy() == pytest.approx(b.heights.numpy(), abs=1e-9)
+    if (index := getattr(a.scene.lens.gradient, "volume", None)) is not None:
+        assert index == pytest.approx(b.scene.lens.gradient.volume, abs=1e-9)
+
+
+def test_a_flat_plate_has_no_face(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    step_file(tmp_path)
+    write_blob(tmp_path / "blob.png")
+    assert run("design", "blob.png", "--base-file", "face.step", "--gradient", "free", "--out", "p") == 2
+    assert "two flat sides" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "element",
+    ["lens z=60 thickness=6 index=1.5", "mirror z=100 tilt=45,0", "lens z=-30 thickness=6 index=1.5"],
+    ids=["behind", "folded", "in front"],
+)
+def test_a_wall_among_other_elements(element, tmp_path, monkeypatch, capsys):
+    """A plate, before or behind, and a flat mirror leave its error as it is by itself."""
+    monkeypatch.chdir(tmp_path)
+    write_blob(tmp_path / "blob.png")
+    how = ["--base-radius=-60", "--entrance", "parallel", "--quality", "draft", "--resolution", 24, "--waves", "off", "--json"]
+    errors = []
+    for name, more in (("a", []), ("b", ["--element", element])):
+        capsys.readouterr()
+        assert run("design", "blob.png", *how, *more, "--out", name) == 0
+        errors.append(json.loads(capsys.readouterr().out)["error"])
+    assert errors[1] == pytest.approx(errors[0], rel=0.1)
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         ([], "--entrance parallel needs --base-radius or --base-file"),
         (["--base-file", "blob.png"], "a STEP file"),
         (["--base-file", "missing.step"], "missing.step"),
         (["--base-file", "face.step", "--base-radius=-30"], "both give the base surface"),
-        (["--base-file", "face.step", "--array", "2x2"], "is of a lens with one designed surface"),
         (["--base-radius=-30", "--mirror"], "light never enters a mirror"),
         (["--base-radius=-30", "--collimate"], "designs the entrance"),
         (["--base-radius=-30", "--array", "2x2"], "is of one lens"),
-        (["--base-radius=-30", "--element", "mirror z=50 tilt=45,0"], "is of a lens by itself"),
+        (["--base-file", "face.step", "--collimate"], "is of a lens with one designed side"),
         (["--base-radius=-10", "--lens-size", "20"], "must exceed the lens' semi-aperture"),
         (["--base-radius=-30,inf", "--relief", "0.1,0"], "must ascend"),
         (["--base-radius=x"], "with inf for straight"),

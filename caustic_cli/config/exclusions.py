@@ -39,15 +39,14 @@ EXCLUDED: dict[str, dict[str, str]] = {
     "lens.base_file": {
         "lens.radius": "⟨lens.base_file⟩ and ⟨lens.radius⟩ both give the base surface: give one of them",
         **dict.fromkeys(
-            ("lens.mirror", "lens.gradient", "lens.array", *TRAITS["two sides"].settings),
-            "⟨lens.base_file⟩ is of a lens with one designed surface, without ⟨{path}⟩",
+            TRAITS["two sides"].settings,
+            "⟨lens.base_file⟩ is of a lens with one designed side, without ⟨{path}⟩",
         ),
     },
     "lens.entrance": {
         "lens.mirror": "⟨lens.entrance⟩ parallel needs a lens: light never enters a mirror",
         "lens.gradient": "⟨lens.entrance⟩ parallel cannot be combined with ⟨lens.gradient⟩, whose index counts from a flat side",
         "lens.array": "⟨lens.entrance⟩ parallel is of one lens: on an array every lenslet has a base surface of its own",
-        "element": "⟨lens.entrance⟩ parallel cannot be combined with ⟨element⟩: it is of a lens by itself",
         **dict.fromkeys(
             TRAITS["two sides"].settings,
             "⟨{path}⟩ designs the entrance, which ⟨lens.entrance⟩ parallel gives: one of them is possible",
@@ -62,7 +61,7 @@ EXCLUDED: dict[str, dict[str, str]] = {
     **{feature: dict.fromkeys(others, _BOTH) | _TWO_SIDES for feature, *others in _SECOND},
     "lens.gradient free": {
         "lens.mirror": "⟨lens.gradient⟩ free needs a lens: light never enters a mirror",
-        "lens.array": "⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat",
+        "lens.array": "⟨lens.array⟩ cannot be combined with a free gradient, whose index is that of the plate as a whole",
         **dict.fromkeys(("design.network", "design.optimizer"), "⟨{path}⟩ of a free gradient must be {default}, got {value}"),
         "design.waves on": "⟨design.waves⟩ on refines heights, but ⟨lens.gradient⟩ free designs the index, by rays",
     },
@@ -70,7 +69,9 @@ EXCLUDED: dict[str, dict[str, str]] = {
         "source.also": "⟨source.each⟩ needs one [[source]], of which there is one behind every lenslet",
         "design.waves on": "{said} is not for ⟨source.each⟩: the light of every source has an image behind the whole array",
     },
-    "design.over": {"design.robust": "⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already"},
+    "design.over": {
+        "design.robust": "⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which draws its scenes anew at every iteration"
+    },
 }
 #: Feature -> settings of which it needs one -> message.
 NEEDED: dict[str, tuple[tuple[str, ...], str]] = {

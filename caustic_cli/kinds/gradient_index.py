@@ -87,6 +87,10 @@ class IndexPlate(AmongElements):
     def sides(cls, lens: LensSettings) -> LensSettings:
         """The lens with what both sides are: flat, on the smallest control net."""
         lens = lens.filled(radius=(math.inf, math.inf))
+        if "base_file" in lens:
+            raise InputError(
+                "⟨lens.gradient⟩ free of a plate has two flat sides, without ⟨lens.base_file⟩; ⟨+lens.with_surface⟩ has one"
+            )
         if any(map(math.isfinite, lens.radius)):
             raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {list(lens.radius)}")
         return lens.filled(control=[p + 1 for p in check("lens.degree", lens.degree)])
