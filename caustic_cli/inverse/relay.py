@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.projection import cells_on_plane
+from caustic_cli.inverse.projected_cells import cells_on_plane
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
