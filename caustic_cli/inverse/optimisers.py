@@ -38,6 +38,9 @@ class Adam:
     parameters in a checkpoint have always been evaluated.  `rejected` counts such steps.
     """
 
+    #: Whether a step changes the tensors of parameters and `state`, instead of replacing them.
+    in_place = True
+
     def __init__(self, objective: Objective, heights: Heights, lr: float):
         self.objective, self.heights, self.loss, self.on_screen = objective, heights, math.inf, 0.0
         self.image: Tensor | None = None
@@ -112,6 +115,9 @@ class Adam:
 
 class QuasiNewton:
     """L-BFGS on half the squared relative RMS, whose curvature near the minimum is that of a least-squares problem."""
+
+    #: As of `Adam`.
+    in_place = False
 
     def __init__(self, objective: Objective, heights: Heights, lr: float):
         self.objective, self.heights = objective, heights

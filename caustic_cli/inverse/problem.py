@@ -7,7 +7,6 @@ loop (`designer`) knows nothing.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -197,7 +196,7 @@ class Problem:
         scene = self.lit(scene, k)
         return self.on_rays(scene, k, self.field(k), self.target, self.stages[k].rays)
 
-    def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
+    def optimiser(self, k: int) -> type[Adam] | type[QuasiNewton]:
         """The optimiser of stage k, made from objective, parametrisation and learning rate."""
         return Adam if self.options.optimizer == "adam" else QuasiNewton
 

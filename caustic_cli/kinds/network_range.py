@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from torch import Tensor
@@ -77,7 +77,7 @@ class NetworkOverRange(OneSurface):
         """Those at all combinations of the ends of the ranges."""
         return self.ranges.ends(self.scene)
 
-    def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
+    def optimiser(self, k: int) -> type[Adam] | type[QuasiNewton]:
         return RangeAdam
 
     def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 from weakref import ref
 
@@ -94,7 +93,7 @@ class OnWaves(Problem):
         before, stage = self.stages[k - 1 : k + 1]
         return bool(before.waves and stage.waves) and before.control == stage.control
 
-    def optimiser(self, k: int) -> Callable[..., Adam | QuasiNewton]:
+    def optimiser(self, k: int) -> type[Adam] | type[QuasiNewton]:
         return QuasiNewton if self.stages[k].waves else super().optimiser(k)
 
     def objective_in(self, scene: Scene, k: int, initial: Tensor) -> LossOfHeights:

@@ -145,7 +145,10 @@ class Records:
         self._write(now, figures or {})
 
     def keep_behind(self, now: State) -> None:
-        """Write a checkpoint while the design goes on; raises as `keep`, of one before."""
+        """Write a checkpoint while the design goes on, unless its next step would change what is written; raises as `keep`, of one
+        before."""
+        if self.designer.problem.optimiser(now.stage).in_place:
+            return self.keep(now)
         self.settle()
         copy = replace(now, history=[*now.history], accuracy=[*now.accuracy])
         self._writing = self._behind.submit(self._write, copy, {})

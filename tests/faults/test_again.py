@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from caustic_cli.errors import CausticError
 from caustic_cli.export import FORMATS
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.kinds import problem_of
-from caustic_cli.project import directory, packing
+from caustic_cli.project import checkpoint, directory, packing
 from caustic_cli.project.project import Project
 from caustic_cli.studies import report
 from caustic_cli.studies.report import Study
@@ -104,6 +105,35 @@ def test_a_checkpoint_that_cannot_be_written_behind_ends_the_design(capfd, monke
     said = capfd.readouterr().err
     assert said.count("\n") == 1 and "no room after iteration" in said and "the one before is intact" in said
     assert load("blob.caustic").figures["iterations"] == 1
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "lbfgs"])
+def test_a_checkpoint_written_behind_is_that_of_its_iteration(optimizer, monkeypatch):
+    """Adam changes parameters and moments in place, which a resumed design would find of another iteration than the lens."""
+    shutil.rmtree("blob.caustic")
+    write_picture()
+    assert cli.run([*DESIGN, "--optimizer", optimizer, "--quiet", "--threads", "1"]) == 0
+    project, further, kept = Project.open("blob.caustic"), threading.Event(), {}
+    designer, write = Designer(problem_of(project)), checkpoint.save
+
+    def slowly(*what):
+        further.wait(0.3)
+        write(*what)
+
+    def on_iteration(now):
+        if now.total == 3:
+            further.set()
+        if now.total == 2:
+            kept.update({name: value.clone() for name, value in (now.parameters | now.optimizer).items()})
+            records.keep_behind(now)
+
+    monkeypatch.setattr(checkpoint, "save", slowly)
+    with progress.Records(project, designer) as records:
+        designer.run(designer.initial_state(), iterations=4, on_iteration=on_iteration)
+    found = project.load().state
+    assert found.total == 2
+    for name, value in (found.parameters | found.optimizer).items():
+        assert torch.equal(value, kept[name]), name
 
 
 def test_nets_compressed_before_they_are_kept_are_those_that_are_kept(monkeypatch):
