@@ -142,7 +142,7 @@ class Records:
             CausticError: it, or one before, could not be written; says which checkpoint is intact.
         """
         self.settle()
-        self._write(now, figures or {})
+        self._write(now, figures or {}, self._nets(now))
 
     def keep_behind(self, now: State) -> None:
         """Write a checkpoint while the design goes on, unless its next step would change what is written; raises as `keep`, of one
@@ -151,7 +151,8 @@ class Records:
             return self.keep(now)
         self.settle()
         copy = replace(now, history=[*now.history], accuracy=[*now.accuracy])
-        self._writing = self._behind.submit(self._write, copy, {})
+        # Without prepared nets: its only thread must not wait for what it is to compress itself.
+        self._writing = self._behind.submit(self._write, copy, {}, None)
 
     def settle(self, wait: bool = True) -> None:
         """Raise the error of a checkpoint that is written behind; wait: until it is written."""
@@ -171,13 +172,13 @@ class Records:
         nets, packed = self._packed
         return packed.result() if all(a is b for a, b in zip(nets, _nets_of(now), strict=True)) else None
 
-    def _write(self, now: State, figures: dict[str, Any]) -> None:
+    def _write(self, now: State, figures: dict[str, Any], nets: dict[str, bytes | None] | None) -> None:
         if self.project.path is None:
             return
         began = time.monotonic()
         spaces = self.designer.field(now.stage).spaces
         try:
-            self.project.save(Checkpoint(now, spaces, self.provenance, figures, self.inputs), self._nets(now))
+            self.project.save(Checkpoint(now, spaces, self.provenance, figures, self.inputs), nets)
         except CausticError as error:
             raise CausticError(f"{error} after iteration {now.total}; {self._safe}") from error
         if not self._before:  # the first checkpoint

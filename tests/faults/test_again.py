@@ -136,6 +136,23 @@ def test_a_checkpoint_written_behind_is_that_of_its_iteration(optimizer, monkeyp
         assert torch.equal(value, kept[name]), name
 
 
+def test_a_checkpoint_written_behind_does_not_wait_for_nets_behind_it():
+    """Those of a design whose last checkpoint is still to be written when its lens is evaluated."""
+    project, written = Project.open("blob.caustic"), threading.Event()
+    designer, state = Designer(problem_of(project)), project.load().state
+    records = progress.Records(project, designer)
+    records._behind.submit(written.wait)
+    records.keep_behind(state)
+    writing = records._writing
+    records.prepare(state)
+    written.set()
+    try:
+        assert writing.result(5.0) is None
+    finally:
+        records._packed[1].cancel()  # what it would wait for without end
+        records._behind.shutdown()
+
+
 def test_nets_compressed_before_they_are_kept_are_those_that_are_kept(monkeypatch):
     """Also where the lens that is kept is another than was expected."""
     monkeypatch.setattr(packing, "LARGE", 1)
