@@ -32,8 +32,8 @@ from caustic_cli.scene import Aperture, Lens, Scene
 from caustic_cli.scene.materials import material
 from caustic_cli.scene.traits import Capability
 
-#: Most sample points along each axis and per knot span, and along each axis before a design.
-MOST, A_SPAN, BEFORE = 2001, 4, 1537
+#: Most sample points along each axis and per knot span.
+MOST, A_SPAN = 2001, 4
 #: Rows of points evaluated at a time.
 ROWS = 64
 #: Thickness of common sheet material, in parts of the width of the plate.
@@ -170,7 +170,7 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -
 
     project: expected size of the finished project, bytes."""
     lens, found = scene.lens, []
-    for z, *derivatives in _strips(field, heights, [min(BEFORE, _points(s)) for s in field.spaces]):
+    for z, *derivatives in _strips(field, heights, [_points(s) for s in field.spaces]):
         bends = curvature.largest(*(lens.cut_from * d for d in derivatives))
         found.append(torch.stack([-z.min(), z.max(), torch.hypot(*derivatives[:2]).max(), bends.max()]))
     low, high, slope, bent = (float(m) for m in torch.stack(found).amax(0) * torch.tensor([-1.0, 1.0, 1.0, 1.0]))
