@@ -124,10 +124,6 @@ def test_a_file_of_indices_is_kept(capfd):
         (("--gradient", "free", "--index-range", "1.6,1.5"), "ascend"),
         (("--gradient", "free", "--waves", "on"), "designs the index, by rays"),
         (("--gradient", "free", "--mirror"), "mirror"),
-        (
-            ("--gradient", "free", "--element", "lens z=20 radius=50,inf free=front"),
-            "--gradient free cannot be combined with [[element]] free",
-        ),
         (("--gradient", "free", "--start", "old.npz"), "--start of a free gradient must be transport"),
         (("--index-control", "12"), "--index-control belongs to --gradient free"),
         (("--gradient", "lens"), "must be one of"),
