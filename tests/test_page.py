@@ -18,13 +18,14 @@ from test_direction import heights
 from test_direction import scene as at_angle
 
 from caustic_cli import cli, load
+from caustic_cli.export import page as pages
 from caustic_cli.export.page import MOST, _coded, _lights, _onto, write_page
 from caustic_cli.io.colorimetry import _into_gamut, rgb_matrix
 from caustic_cli.io.files import is_ours
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Component, Disc, FoldMirror, FreeForm, Lens, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene import Component, Disc, FoldMirror, FreeForm, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.screen import Sags
 from caustic_cli.scene.sources.gaussian import Gaussian
@@ -293,6 +294,28 @@ def test_light_leans_from_its_own_direction(tmp_path):
     wanted = expose(leaning, field, z, rays_of(leaning, "stratified", 1_000_000)).image.numpy()
     found = by_node(tmp_path / "page.html", lit.screen.z, (0.0, 4.0))
     assert relative_rms(found, wanted) < ALIKE < relative_rms(found, by_node(tmp_path / "page.html", lit.screen.z))
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js to run the page's functions")
+@pytest.mark.parametrize(("wide", "most"), [(1.5, 0.5), (4.0, 0.25)])
+def test_a_disc_in_focus_is_even(wide, most, tmp_path, monkeypatch):
+    """A lens that images an even disc onto the screen, `wide` pixels across: the hardest of all pictures for a few points of it.
+
+    2,000 points leave 0.005 and 0.03."""
+    monkeypatch.setattr(pages, "CELLS", (256,))
+    away, thickness, throw, pixels, n = 40.0, 1.0, 161.0, 12, 1.5
+    apparent = away + thickness / n
+    radius = (n - 1.0) / (1.0 / apparent + 1.0 / (throw - thickness))  # of a thin lens, paraxially
+    size = wide * apparent / (throw - thickness)
+    lens = Lens((1.0, 1.0), index=n, control=(12, 12), offset=Offset(thickness, (-radius, -radius)), fresnel="none")
+    lit = Scene(Disc((0.0, 0.0, -away), (size, size), cone=3.0), lens, Screen((pixels, pixels), throw, (pixels, pixels)))
+    field = HeightField.of(lens)
+    z = torch.from_numpy(lens.offset.heights(*(c.numpy() for c in field.control_xy())))
+    write_page(tmp_path / "page.html", lit, field, z)
+    found = by_node(tmp_path / "page.html", throw)
+    at = (np.arange(100 * pixels) + 0.5) / 100.0 - 0.5 * pixels
+    disc = (np.hypot(at[:, None], at[None, :]) < 0.5 * wide).reshape(pixels, 100, pixels, 100).mean((1, 3))
+    assert relative_rms(found, disc * found.sum() / disc.sum()) < most
 
 
 def hollow(rough: float = 0.004) -> FreeForm:

@@ -6,14 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from helpers import write_blob
 
 from caustic_cli import cli, load
 from caustic_cli.inverse.lens_space import undeviated_ray
+from caustic_cli.inverse.projection import FarProjection, stretching_surface
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scene_parameters import Range, Ranges
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
 from caustic_cli.project.completion import complete
 from caustic_cli.scene import Component, FoldMirror, Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene.screen import FOCAL
 
 THICKNESS, INDEX, ANGLE, THROW = 6.0, 1.5, 10.0, 300.0
 SINE, COSINE = math.sin(math.radians(ANGLE)), math.cos(math.radians(ANGLE))
@@ -141,11 +147,68 @@ def test_designs_in_tilted_light(in_tmp, capfd, elements, at):
     assert made["on_screen"] > 0.85 * alone["on_screen"]
 
 
-def test_a_far_picture_stands_in_the_direction_of_the_light(in_tmp, capfd):
-    """Whose tilt says so: a decentre of the screen would turn it twice."""
+@pytest.mark.parametrize("elements", [(), (PLATE,), (FOLD,)], ids=["alone", "plate", "mirror"])
+@pytest.mark.parametrize("tilt", [(ANGLE, 0.0), (0.0, ANGLE), (7.0, 5.0)])
+def test_a_far_screen_stands_where_light_lands_that_nothing_deflects(elements, tilt):
+    """A plane exit leaves the light as it is, and an ideal lens of the focal length F sends it F tan(angle) aside."""
+    own = [{"type": "mirror" if e is FOLD else "lens", "z": e.z, "size": e.size} for e in elements]
+    own = [
+        {**o, **({"tilt": e.tilt} if e is FOLD else {"thickness": THICKNESS, "index": INDEX})}
+        for o, e in zip(own, elements, strict=True)
+    ]
+    given = {"source": {"tilt": list(tilt)}, "screen": {"z": FOCAL, "far": True}, "element": {"list": own}}
+    placed = complete(given, 1.0).screen
+    straight = PlaneWave(tilt=tilt).axis
+    signs = (1, -1 if FOLD in elements else 1)
+    assert placed.shift == pytest.approx([s * FOCAL * c / straight[2] for s, c in zip(signs, straight, strict=False)], abs=1e-3)
+    far = Screen((30.0, 30.0), FOCAL, (5, 5), tilt=tuple(placed.tilt), shift=tuple(placed.shift), far=True)
+    lit = replace(scene(*elements, tilt=tilt), screen=far)
+    field = HeightField.of(lit.lens)
+    picture = expose(lit, field, torch.full(field.shape, 5.0, dtype=torch.float64), rays_of(lit, "stratified", 1000)).image
+    assert float(picture[2, 2]) > 0.7
+    assert float(picture[2, 2]) == pytest.approx(float(picture.sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (60.0, -170.0)])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_far_field_is_linear_about_the_middle_of_the_screen(shift, side):
+    """Direction cosines and their derivatives there, by finite differences of directions to points of a tilted far screen."""
+    screen = Screen((30.0, 30.0), side * FOCAL, tilt=(10.0, -20.0), shift=shift, far=True)
+    seen = FarProjection(screen, 5.0, side)
+    step = 1e-3 * np.array([[0.0, 1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0]])
+    ahead = FOCAL * np.stack(seen.directions_to(*seen.project(*step))(0.0, 0.0, 0.0))[:2]
+    assert np.linalg.norm(ahead[:, 0]) < FOCAL
+    assert np.stack(seen.project(*step))[:, 0] == pytest.approx(ahead[:, 0], abs=1e-9)
+    assert seen.linear == pytest.approx(np.stack([ahead[:, 1] - ahead[:, 2], ahead[:, 3] - ahead[:, 4]], 1) / 2e-3, abs=1e-6)
+
+
+def test_a_far_picture_is_as_good_as_one_nearby_in_the_same_light(in_tmp, capfd):
+    """Without a slope that would turn the light: 0.35 on the way back to the axis."""
     write_blob()
-    assert design("--source-tilt", f"{ANGLE:g},0", "--throw", "inf", "--json") == 0
-    made = json.loads(capfd.readouterr().out)
-    screen = load("p").scene.screen
-    assert screen.shift == (0.0, 0.0) and screen.axes[2] == pytest.approx((0.0, -SINE, COSINE), abs=1e-12)
-    assert made["error"] < 0.2
+    made = []
+    for throw in ("900", "inf"):
+        assert design("--source-tilt", f"{ANGLE:g},0", "--throw", throw, "--json", "--force") == 0
+        made.append(json.loads(capfd.readouterr().out)["error"])
+    lens = load("p")
+    across = np.diff(np.asarray(lens.heights.detach()), axis=1).mean() * (lens.heights.shape[1] - 1) / lens.scene.lens.size[1]
+    assert abs(across) < 0.02
+    assert made[1] < 1.1 * made[0]
+
+
+@pytest.mark.parametrize("far", [False, True])
+def test_the_quadratic_surface_stretches_the_lens_onto_the_screen_in_tilted_light(far):
+    """A plane wave over a square has, through a quadratic surface, an even square as its image, to first order."""
+    z = FOCAL if far else THROW
+    screen = Screen((90.0, 60.0), z, (60, 60), tilt=(ANGLE, 0.0), shift=(0.0, -z * SINE / COSINE), far=far)
+    lit = replace(scene(), lens=replace(LENS, size=(10.0, 10.0), control=(12, 12)), screen=replace(screen, size=(60.0, 40.0)))
+    field = HeightField.of(lit.lens)
+    x, y = (c.numpy() for c in field.control_xy())
+    heights = torch.from_numpy(stretching_surface(lit, x, y))
+    picture = expose(replace(lit, screen=screen), field, heights, rays_of(lit, "stratified", 10_000)).image.numpy()
+    for axis, wide in enumerate((60.0, 40.0)):
+        along, c = picture.sum(1 - axis), (np.arange(60) + 0.5) * screen.pixel[axis]
+        mean = along @ c / along.sum()
+        # The sides of the lens take a tenth of the light, along y.
+        assert math.sqrt(along @ (c - mean) ** 2 / along.sum()) == pytest.approx(
+            wide / math.sqrt(12.0), rel=0.04 if axis == 0 else 0.12
+        )

@@ -123,8 +123,8 @@ def stand(s: Settings, by: Parameters, room: RoomSettings | None, given: Mapping
     if by.screen_place is None or s.screen.far:
         if not source.lean or s.second is not None:
             return s.screen
-        (x, y), tilt = _among(s, source, s.elements, s.screen.z) if s.elements else _straight_on(s, source)
-        return s.screen.filled(tilt=tilt, shift=[0.0, 0.0] if s.screen.far else [x, y])
+        (x, y), tilt = _among(s, source, s.elements, s.screen.z, s.screen.far) if s.elements else _straight_on(s, source)
+        return s.screen.filled(tilt=tilt, shift=[x, y])
     twice = ["⟨throw⟩"] * (by.throw is not None) + [f"⟨screen.{key}⟩" for key in ("z", "tilt", "shift") if key in given]
     if twice or s.elements:
         why = f"{twice[0]} would be another" if twice else "⟨element⟩ has the screen on its own axis"
@@ -142,8 +142,11 @@ def _straight_on(s: Settings, source: Source) -> tuple[tuple[float, float], list
     return (x, y), [interaction_of(s.lens.mirror).side * angle + 0.0 for angle in source.tilt]
 
 
-def _among(s: Settings, source: Source, elements: Sequence[ElementSettings], z: float) -> tuple[tuple[float, float], list[float]]:
-    """The same through other elements, at a distance z along the folded axis, mm.
+def _among(
+    s: Settings, source: Source, elements: Sequence[ElementSettings], z: float, far: bool = False
+) -> tuple[tuple[float, float], list[float]]:
+    """The same through other elements, at a distance z along the folded axis, mm; far: in the focal plane of a lens of the focal
+    length z behind them, to whose middle the light goes, wherever it leaves them.
 
     Raises:
         InputError: an element is invalid, or the light does not arrive.
@@ -156,6 +159,8 @@ def _among(s: Settings, source: Source, elements: Sequence[ElementSettings], z: 
         elements=tuple(build_component(element, s.lens.wavelength) for element in beside),
     )
     place, direction = lens_space.undeviated_ray(scene)
+    if far:
+        place = z * direction[0], z * direction[1]
     return place, [round(angle, ANGLE_DECIMALS) for angle in rooms.tilt_of(direction)]
 
 

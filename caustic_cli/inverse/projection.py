@@ -252,9 +252,9 @@ class FarProjection(BeamProjection):
     @cached_property
     def _linear(self) -> tuple[np.ndarray, np.ndarray]:
         """As of a `BeamProjection`."""
-        along = np.array(self.screen.axes[:2]).T
-        ahead = np.array(self.screen.axes[2]) * self.distance * self.forward
-        return (ahead + along @ shape_of(self.screen).centre)[:2], along[:2]
+        axes, own = np.array(self.screen.axes).T, np.array(shape_of(self.screen).centre) / self.distance
+        along = self.forward * math.sqrt(1.0 - own @ own)
+        return self.distance * (axes @ (*own, along))[:2], (axes[:, :2] - np.outer(axes[:, 2], own / along))[:2]
 
     def directions_to(self, u: np.ndarray, v: np.ndarray) -> Callable[..., tuple]:
         """As of a `ScreenProjection`; exact, though (u, v) of a tilted screen are linear in its coordinates."""
@@ -291,7 +291,7 @@ def stretching_surface(scene: Scene, x: np.ndarray, y: np.ndarray) -> np.ndarray
     first order: the optimal map between normal distributions of their second moments (Olkin & Pukelsheim, Linear Algebra Appl. 48,
     1982)."""
     screen, lens = scene.screen, scene.lens
-    to = BeamProjection(screen, lens.offset.thickness, lens.interaction.side, scene.source.axis)
+    to = (FarProjection if screen.far else BeamProjection)(screen, lens.offset.thickness, lens.interaction.side, scene.source.axis)
     half, across = np.diag(lens.half_size), to.linear @ np.diag(screen.half_size)
     values, vectors = np.linalg.eigh(half @ across @ across.T @ half)
     stretch = np.linalg.solve(half, vectors @ np.diag(np.sqrt(values.clip(0.0))) @ vectors.T) @ np.linalg.inv(half) - np.diag(

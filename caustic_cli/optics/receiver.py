@@ -70,7 +70,7 @@ class Receiver:
         if isinstance(screen, Screen):
             return cls.on_axis(screen, system.axis)
         inner, (axes, (x, y, z)) = screen.screen, (screen.pose.axes, screen.pose.position)
-        if inner.curved:  # its shape is that about its centre
+        if inner.curved or inner.far:  # its shape is that about its centre
             sx, sy = inner.shift
             x, y, z = (m + sx * a + sy * b for m, a, b in zip((x, y, z), *axes[:2], strict=True))
             return cls.centred(inner, (x, y, z), axes, system.axis)

@@ -22,8 +22,8 @@ const FRESNEL = { none: 0, schlick: 1, exact: 2 };
 const SMALLEST = 1e-3; // of a rectangle's sides, pixels: folded light has none
 const MARGIN = 8; // pixels beyond the screen that the graphics processor draws on, since points are dropped by their middle
 const SLICE = 14; // ms of work between two answers to the person
-const BLUR = 3; // beams for each square pixel of the blur, and at most, of one place of an extended source
-const MOST_BEAMS = 300;
+const BLUR = 12; // beams for each square pixel of the blur, and at least and at most, of one place of an extended source
+const FEWEST_BEAMS = 24, MOST_BEAMS = 300;
 const DEEPEST = 100; // times that the relief is shown as deep
 const STEPS = 12, FINE = 1e-7; // of Newton's method, at most, and the length of the last, mm, whose error is its square
 const GOLDEN = Math.PI * (3 - Math.sqrt(5));
@@ -124,7 +124,7 @@ function beamsOf(setting, most = MOST_BEAMS) {
     const extent = extentOf(light, setting.size), places = light.places.length;
     const far = Math.abs(setting.z - held.lens.zIn) / (light.near ? 1 : light.axis[2]);
     const blur = Math.max(...extent.map((e, k) => ((2 * e) / pixel[k]) * (light.near ? far / Math.abs(light.places[0][2]) : far)));
-    let count = blur < 0.2 ? 1 : Math.min(Math.max(8, Math.ceil(BLUR * blur * blur)), Math.ceil(most / Math.sqrt(places)));
+    let count = blur < 0.2 ? 1 : Math.min(Math.max(FEWEST_BEAMS, Math.ceil(BLUR * blur * blur)), Math.ceil(most / Math.sqrt(places)));
     if (light.picture && count > 1) count = Math.min(most, light.picture.length);
     light.places.forEach(([x, y, z, part], place) => {
       const points = spots(light, count, places, place), from = light.near ? [] : directions(light, rows, extent, points);
