@@ -15,6 +15,7 @@ from caustic_cli.inverse.projection import FarProjection, stretching_surface
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.scene_parameters import Range, Ranges
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.project.completion import complete
@@ -212,3 +213,41 @@ def test_the_quadratic_surface_stretches_the_lens_onto_the_screen_in_tilted_ligh
         assert math.sqrt(along @ (c - mean) ** 2 / along.sum()) == pytest.approx(
             wide / math.sqrt(12.0), rel=0.04 if axis == 0 else 0.12
         )
+
+
+def test_a_decentred_far_picture_behind_a_mirror_is_that_of_the_straight_scene():
+    """Traced along the folded axis, and seen in the mirror: a plane lens sends all light to one place off the middle."""
+    far = Screen((60.0, 60.0), 1000.0, (20, 20), shift=(7.5, 190.0), tilt=(-ANGLE, 0.0), far=True)
+    folded = replace(scene(FOLD), screen=far)
+    images = []
+    for one in (folded, folded.unfolded):
+        field = HeightField.of(one.lens)
+        flat = torch.full([s.n for s in field.spaces], 5.0, dtype=torch.float64)
+        images.append(expose(one, field, flat, rays_of(one, "stratified", 2000, 0)).image.numpy())
+    assert images[0].sum() > 0.5
+    assert np.abs(images[0] - images[1]).max() < 1e-3
+    x, y = ((images[0].sum(axis) @ (3.0 * np.arange(20) - 28.5)) / images[0].sum() for axis in (1, 0))
+    beside = 190.0 - 1000.0 * SINE / COSINE
+    assert (x, y) == pytest.approx((-7.5, -beside * COSINE), abs=1.6)
+
+
+@pytest.mark.parametrize(
+    ("element", "towards"),
+    [
+        (None, (0.0, -SINE, COSINE)),
+        ("lens z=60 thickness=6 index=1.5", (0.0, -SINE, COSINE)),
+        ("mirror z=100 tilt=45,0", (0.0, SINE, COSINE)),
+    ],
+    ids=["alone", "plate", "mirror"],
+)
+def test_a_far_picture_stands_in_the_direction_of_the_light(in_tmp, capfd, element, towards):
+    """In its middle light lands that the lens does not deviate, which tilted light before a prism would not be."""
+    write_blob()
+    elements = () if element is None else ("--element", element)
+    assert design("--source-tilt", f"{ANGLE:g},0", "--throw", "inf", "--json", *elements) == 0
+    made = json.loads(capfd.readouterr().out)
+    screen = load("p").scene.screen
+    away = 1e6 * np.array(towards)[:, None]
+    there = shape_of(screen).coordinates(away, np.array(screen.centre), screen.axes)
+    assert np.abs(there).max() < 2e-3  # mrad: tilts are kept to 1e-4 degrees
+    assert made["error"] < 0.2

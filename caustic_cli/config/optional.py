@@ -160,7 +160,7 @@ def _among(
     )
     place, direction = lens_space.undeviated_ray(scene)
     if far:
-        place = z * direction[0], z * direction[1]
+        place = z * direction[0] / direction[2], z * direction[1] / direction[2]
     return place, [round(angle, ANGLE_DECIMALS) for angle in rooms.tilt_of(direction)]
 
 

@@ -40,7 +40,7 @@ STEP, NEWTON, LEFT = 1e-6, 8, 1e-6
 IMAGED = 1e-3
 #: Off-diagonal part of the derivatives of u by X that is rounding, and the least squared cosine of a first estimate to the axis.
 ALIGNED, GRAZING = 1e-6, 1e-2
-UNSEEN = "[[element]] the axial ray does not reach the screen from the lens; check the mirrors' tilts and the radii"
+UNSEEN = "[[element]] light through the middle of the lens does not reach the screen; check tilts and radii"
 
 
 def without_freeforms(scene: Scene) -> Scene:
