@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from helpers import begun
+from helpers import begun, write_blob
 from PIL import Image
 from rayfiles import cone_of, tm25
 from scipy.ndimage import maximum_filter
@@ -44,6 +44,7 @@ from caustic_cli.optics.surfaces.facets import FacetSurface
 from caustic_cli.optics.system import ENTRANCE, EXIT, PlacedScreen, System, split_heights
 from caustic_cli.optics.trace import Tracer, expose, render
 from caustic_cli.optics.waves.image import wave_image
+from caustic_cli.project.completion import complete
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Aperture, Component, FoldMirror, Lens, Light, Offset, PlaneWave, Points, Pupil, Scene, Screen
 from caustic_cli.scene.gradient import Gradient
@@ -841,3 +842,48 @@ def test_measured_surfaces_stand_among_other_elements():
     flat = torch.full(FIELD.shape, 5.0, dtype=torch.float64)
     images = [expose(scene, surface, flat, rays_of(scene, "grid", 4000)).image for surface in (facets, FIELD)]
     assert images[0].numpy() == pytest.approx(images[1].numpy(), abs=1e-7) and float(images[1].sum()) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("far", "element", "width"),
+    [
+        # a picture of 30 mm at 300 mm by a lens of 10 mm: through nothing, a plate, a thin lens of 120 mm at 60 mm (X = 180 q - x)
+        (False, {"type": "mirror", "tilt": [0.0, 45.0]}, 10.0 + 20.0 * 0.2),
+        (False, {"radius": [math.inf, math.inf], "index": 1.5, "thickness": 6.0}, 14.0),
+        (False, {"radius": [120.0, -120.0], "index": 1.5, "thickness": 8.0}, 2.0 * (5.0 + 60.0 * (15.0 + 5.0) / 180.0)),
+        # a concave mirror of the same focal length, and one that diverges: X = 420 q + 3 x
+        (False, {"type": "mirror", "tilt": [0.0, 45.0], "radius": [-240.0, math.inf]}, 2.0 * (5.0 + 60.0 * 20.0 / 180.0)),
+        (False, {"type": "mirror", "tilt": [0.0, 45.0], "radius": [240.0, math.inf]}, 14.0),
+        # directions of X / 300 behind the lens, X = 300 (q (1 - 60 / 120) - x / 120)
+        (
+            True,
+            {"radius": [120.0, -120.0], "index": 1.5, "thickness": 8.0},
+            2.0 * (5.0 + 60.0 * (15.0 / 300.0 + 5.0 / 120.0) / 0.5),
+        ),
+    ],
+)
+def test_an_element_is_as_wide_as_the_beam_that_makes_the_picture(far, element, width):
+    given = {"lens": {"size": [10.0, 10.0]}, "target": {"size": [30.0, 30.0]}, "screen": {"z": 300.0, "far": far}}
+    made = complete({**given, "element": {"list": [{"z": 60.0, **element}]}}, 1.0).elements[0]
+    lean = math.cos(math.radians(max(made.tilt or (0.0, 0.0))))
+    assert made.size == pytest.approx([1.2 * width / lean, 1.2 * width], rel=1e-6)
+
+
+def test_a_default_lens_is_no_wider_than_its_thickness_lets_it_be():
+    thin = {"z": 60.0, "radius": [60.0, -60.0], "index": 1.5, "thickness": 4.0}
+    made = complete({"screen": {"z": 300.0}, "element": {"list": [thin]}}, 1.0).elements[0]
+    edge = 4.0 - 2.0 * (60.0 - math.sqrt(60.0**2 - 0.5 * made.size[0] ** 2))
+    assert 0.0 < edge < 1.0 and made.size[0] > 1.2 * 14.0
+
+
+def test_a_far_picture_behind_a_lens_takes_all_light(tmp_path, monkeypatch, capfd):
+    """By a lens of the default size: one as wide as an undeflected beam lost half of it."""
+    monkeypatch.chdir(tmp_path)
+    write_blob("blob.png", 24, (11, 13), 6.0)
+    lens = "lens z=60 thickness=8 radius=120,-120 index=1.5"
+    options = ("--throw", "inf", "--resolution", "24", "--quality", "draft", "--waves", "off", "--control", "40")
+    assert cli.run(["design", "blob.png", *options, "--element", lens, "--json", "--quiet"]) == 0
+    made = json.loads(capfd.readouterr().out)
+    index = load("blob.caustic").scene.lens.index
+    transmitted = (0.96 * (1.0 - ((index - 1.0) / (index + 1.0)) ** 2)) ** 2  # by two surfaces each
+    assert made["on_screen"] == pytest.approx(transmitted, abs=3e-3)

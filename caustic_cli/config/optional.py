@@ -37,6 +37,10 @@ ANGLE_DECIMALS, SAME_ANGLE = 4, 0.01
 OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
 #: Size of elements and thickness of a lens that one ray passes, mm.
 POINT, THIN = (1e-3, 1e-3), 1e-3
+#: Least reach of a slope on the screen, in parts of its distance, by which light is sent to the picture.
+LEAST_REACH = 0.02
+#: Parts of the way from the size of a beam to that of an undeflected one that are tried where a lens would have no edge.
+SMALLER = tuple(k / 50 for k in range(51))
 BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
 
 
@@ -246,10 +250,57 @@ def complete_elements(s: Settings) -> tuple[ElementSettings, ...]:
 def _complete_element(element: ElementSettings, s: Settings, source: Source, before: Sequence[ElementSettings]) -> ElementSettings:
     if "z" not in element or "size" in element:
         return element
-    along = min(1.0, max(0.0, check("element.z", element.z) / abs(s.screen.z)))
-    size = [BEAM * (a + (b - a) * along) if along else a for a, b in zip(s.lens.size, s.target.size, strict=True)]
-    if along and source.lean:  # the light leaves the axis, on which the element stands
+    behind = check("element.z", element.z) > 0.0
+    straight = min(1.0, element.z / abs(s.screen.z)) if behind else 0.0
+    undeflected = [a + (b - a) * straight for a, b in zip(s.lens.size, s.target.size, strict=True)]
+    beam = _beam(s, element.z, undeflected) if behind else undeflected
+    size = [BEAM * width for width in beam] if behind else beam
+    if behind and source.lean:  # the light leaves the axis, on which the element stands
         size = [w + 2.0 * abs(c) for w, c in zip(size, _among(s, source, before, element.z)[0], strict=True)]
     lean = [math.cos(math.radians(t)) for t in check("element.tilt", element.tilt or (0.0, 0.0))]
     size = [w / c for w, c in zip(size, lean[::-1], strict=True)]
-    return element.changed(size=[max(size)] * 2 if element.aperture == "circle" else size)
+    size = [max(size)] * 2 if element.aperture == "circle" else size
+    least = max(a / b for a, b in zip(undeflected, beam, strict=True))
+    sizes = ([(1.0 + part * (least - 1.0)) * width for width in size] for part in SMALLER)
+    return element.changed(size=next((smaller for smaller in sizes if _is_possible(element, smaller, s)), size))
+
+
+def _beam(s: Settings, place: float, undeflected: Sequence[float]) -> list[float]:
+    """Widths at a distance `place` along the folded axis, mm, of a beam from the lens' edges to those of the picture, and no less
+    than those of an `undeflected` one.
+
+    Paraxially: a ray leaves the lens at x with the slope q = (X - A x) / B, by which it arrives at X (ABCD matrices of thin
+    lenses).
+    """
+    lenses = sorted(
+        (element.z, build_component(element.changed(size=list(POINT)), s.lens.wavelength).power)
+        for element in s.elements
+        if "z" in element and 0.0 < element.z < abs(s.screen.z)
+    )
+
+    def matrix(end: float) -> tuple[float, float, float, float]:
+        a, b, c, d, at = 1.0, 0.0, 0.0, 1.0, 0.0
+        for z, power in (one for one in lenses if one[0] < end):
+            a, b = a + (z - at) * c, b + (z - at) * d
+            c, d, at = c - power * a, d - power * b, z
+        return a + (end - at) * c, b + (end - at) * d, c, d
+
+    a, b, _, _ = matrix(place)
+    whole = matrix(abs(s.screen.z))
+    to_x, to_q = (abs(s.screen.z) * m for m in whole[2:]) if s.screen.far else whole[:2]
+    if abs(to_q) <= LEAST_REACH * abs(s.screen.z):  # the lens is imaged onto the screen
+        return [*undeflected]
+    sides = [
+        [abs(a * lens + b * (side * picture - to_x * lens) / to_q) for side in (1.0, -1.0)]
+        for lens, picture in zip(s.lens.size, s.target.size, strict=True)
+    ]
+    return [round(max(width, *found), 6) for width, found in zip(undeflected, sides, strict=True)]
+
+
+def _is_possible(element: ElementSettings, size: list[float], s: Settings) -> bool:
+    """Whether an element can have this size: the surfaces of a lens may cross at its rim."""
+    try:
+        build_component(element.changed(size=size), s.lens.wavelength)
+    except InputError:
+        return False
+    return True

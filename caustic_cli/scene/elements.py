@@ -177,6 +177,11 @@ class Component:
             surfaces=(own, other),
         )
 
+    @property
+    def power(self) -> float:
+        """Refractive power of its spheres as a thin lens in air, 1/mm."""
+        return (self.index - 1.0) * (1.0 / self.radius[0] - 1.0 / self.radius[1])
+
     def at(self, wavelength: float) -> Component:
         """The component with its index evaluated at a wavelength, nm."""
         return self if self.glass is None else replace(self, index=nearest_index(self.glass, wavelength))
@@ -189,6 +194,11 @@ class FoldMirror(Component):
     interaction: ClassVar[Refracting | Reflecting] = Reflecting()
     sides: ClassVar[tuple[str, ...]] = SIDES[:1]
     refracting: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def power(self) -> float:
+        """As of a lens, for light along its axis."""
+        return -2.0 / self.radius[0]
 
     def _check(self) -> None:
         if self.free in ("back", "both"):
