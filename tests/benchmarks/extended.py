@@ -107,7 +107,8 @@ def of_project(path: Path) -> str:
         return np.stack([u[nearest], v[nearest]])
 
     target = np.asarray(lens.target)
-    whole, alike = (performance_limits(lens.scene, target, sent=how).error for how in (None, sent))
+    # None where the source does not limit it
+    whole, alike = (performance_limits(lens.scene, target, sent=how).error or 0.0 for how in (None, sent))
     return f"{path}: at least {whole:.4f} for any lens, {alike:.4f} for those that send their light about where it does"
 
 
