@@ -887,3 +887,12 @@ def test_a_far_picture_behind_a_lens_takes_all_light(tmp_path, monkeypatch, capf
     index = load("blob.caustic").scene.lens.index
     transmitted = (0.96 * (1.0 - ((index - 1.0) / (index + 1.0)) ** 2)) ** 2  # by two surfaces each
     assert made["on_screen"] == pytest.approx(transmitted, abs=3e-3)
+
+
+def test_a_lens_far_beyond_the_screen_is_not_refused_for_the_width_of_a_beam_there(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    write_blob("blob.png", 24, (11, 13), 6.0)
+    for lens, word in (("radius=30,-30", "thickness"), ("radius=300,-300 thickness=8", "screen")):
+        assert cli.run(["design", "blob.png", "--element", f"lens z=1e9 {lens}", "--quiet"]) == 2
+        said = capfd.readouterr().err
+        assert said.count("\n") == 1 and "size" not in said and word in said

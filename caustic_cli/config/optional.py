@@ -251,9 +251,10 @@ def _complete_element(element: ElementSettings, s: Settings, source: Source, bef
     if "z" not in element or "size" in element:
         return element
     behind = check("element.z", element.z) > 0.0
-    straight = min(1.0, element.z / abs(s.screen.z)) if behind else 0.0
+    place = min(element.z, abs(s.screen.z))  # what stands beyond the screen is refused later
+    straight = place / abs(s.screen.z) if behind else 0.0
     undeflected = [a + (b - a) * straight for a, b in zip(s.lens.size, s.target.size, strict=True)]
-    beam = _beam(s, element.z, undeflected) if behind else undeflected
+    beam = _beam(s, place, undeflected) if behind else undeflected
     size = [BEAM * width for width in beam] if behind else beam
     if behind and source.lean:  # the light leaves the axis, on which the element stands
         size = [w + 2.0 * abs(c) for w, c in zip(size, _among(s, source, before, element.z)[0], strict=True)]

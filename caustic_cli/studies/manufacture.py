@@ -25,6 +25,7 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.media import medium_of
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.strips import ROWS
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System, entrance_of
 from caustic_cli.optics.trace import Tracer
@@ -34,8 +35,6 @@ from caustic_cli.scene.traits import Capability
 
 #: Most sample points along each axis and per knot span.
 MOST, A_SPAN = 2001, 4
-#: Rows of points evaluated at a time.
-ROWS = 64
 #: Thickness of common sheet material, in parts of the width of the plate.
 SHEET = 0.08
 #: Finite-difference steps of the sensitivities: of the throw, relative; of the index.

@@ -84,9 +84,9 @@ class LightField:
     def words(self) -> str:
         """What is held of the file, and with what noise, in a sentence."""
         wide = " × ".join(f"{2.0 * self.sigma * 2.0 * r:.2g}" for r in self.points[0].pupil.half_size)
-        points = "1 point" if len(self.points) == 1 else f"{len(self.points)} points"
+        points = "1 point with an intensity" if len(self.points) == 1 else f"{len(self.points)} points with an intensity each"
         return (
-            f"The light of the ray file is held as {points} with an intensity each, averaged over {wide} mm of the pupil, from the"
+            f"The light of the ray file is held as {points}, averaged over {wide} mm of the pupil, from the"
             f" {self.rays:,} rays that meet it: about {self.noise:.1%} of noise in the picture, as broad patches; light displaced"
             f" by about {self.blur:.1f} pixels; shadows on the pupil blurred. The screen moves on this page, this light does not."
         )
