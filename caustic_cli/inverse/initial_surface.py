@@ -41,9 +41,12 @@ COARSE = 512
 BESIDE = 0.005
 #: Cells along the lens on which the shadow of its sides is found in tilted light.
 ROUGH = 128
-#: Sites per bright pixel where the map is evaluated on finer cells; fraction of the cells then needed that is accepted if it
-#: divides the finer ones.
-SITES, NEARLY = 2, 0.95
+#: Cells per bright pixel where the map is evaluated on finer cells, as are sites: 2 x 2, at a distance from its edges that the
+#: spread of their light needs, and not too near to each other; fraction of the cells then needed that is accepted if it divides the
+#: finer ones.
+SITES, NEARLY = 4, 0.95
+#: Fewest cells on which it then is solved, in COARSE.
+FEWEST = 0.5
 #: Transport error and Newton steps per level for finer cells, which resolve it: 5e-3 left text with errors of 0.088 to 0.123.
 EXACT, STEPS = 5e-4, 30
 #: Largest peak-to-valley ratio of an interpolated control net to the surface.
@@ -315,7 +318,7 @@ def first_surface(
     times, options = _refinement(cells, target, coarse), {}
     cells = min(cells, 2 * coarse * times) // times
     if times > 1:
-        options = {"tolerance": EXACT, "most": STEPS}
+        options = {"tolerance": EXACT, "most": STEPS, "times": times}
     grid, lens = _Grid.of(scene, target, cells, array=array), scene.lens
     z = grid.offset
     if scene.source.oblique:  # the shadow of the lens' sides depends on the heights
@@ -366,11 +369,11 @@ def _refinement(cells: int, target: np.ndarray, coarse: int) -> int:
 
     A map on finer cells concentrates the light of a site in a point, so that sites have to be finer than bright pixels.
     """
-    most, needed = 2 * coarse, max(coarse, math.sqrt(SITES * np.count_nonzero(target)))
+    most, needed = 2 * coarse, max(FEWEST * coarse, math.sqrt(SITES * np.count_nonzero(target)))
     if cells <= most or needed > most:
         return 1
     whole = max(t for t in range(1, cells) if cells % t == 0 and cells >= NEARLY * needed * t)
-    return whole if cells <= most * whole else -(-cells // coarse)
+    return whole if cells <= most * whole else math.ceil(cells / needed)
 
 
 def _best(grid: _Grid, middle: float, fixed: bool) -> _TruncatedSurface:

@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from caustic_cli.inverse.creases import Spots
 from caustic_cli.inverse.transport import point_masses
 from caustic_cli.loading import OnDemand
 
@@ -32,13 +33,15 @@ OPTIONS = "Qt Q12"  # triangulated; with wide facets where sites are nearly copl
 
 @dataclass(frozen=True, eq=False)
 class Scattered:
-    """Point masses (N,) at y1, y2 (N,), mm, for a source of these half sizes, mm; and their own places, (2, N) mm."""
+    """Point masses (N,) at y1, y2 (N,), mm, for a source of these half sizes, mm; their own places, (2, N) mm; and
+    what they are of a picture, if of one."""
 
     y1: np.ndarray
     y2: np.ndarray
     mass: np.ndarray
     half: tuple[float, float]
     home: np.ndarray
+    spots: Spots | None = None
     _last: list[LowerHull] = field(default_factory=list, init=False, repr=False)
 
     def envelope(self, psi: np.ndarray) -> LowerHull:
@@ -127,9 +130,10 @@ class Pixels:
     project: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
     centre: tuple[float, float] = (0.0, 0.0)
 
-    def sites(self, source: np.ndarray, source_half: tuple[float, float], fewer: int = 1) -> Scattered:
-        """The point masses of this picture for a source of these cells, or `fewer` times fewer."""
-        x, y, mass = point_masses(source, self.power, self.half, fewer=fewer)
+    def sites(self, source: np.ndarray, source_half: tuple[float, float], fewer: int = 1, times: int = 1) -> Scattered:
+        """The point masses of this picture for a source of these cells, or `fewer` times fewer; times: as of `transport.solve`."""
+        x, y, mass = point_masses(source, self.power, self.half, fewer=fewer, times=times)
+        spots = Spots((x, y), mass, self.power > 0, self.half)
         if self.project:
             x, y = (c - middle for c, middle in zip(self.project(x, y), self.centre, strict=True))
-        return Scattered(x, y, mass, source_half, np.stack([x, y]))
+        return Scattered(x, y, mass, source_half, np.stack([x, y]), spots)

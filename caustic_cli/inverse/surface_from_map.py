@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,9 +49,9 @@ DISTINCT = 1e-9  # least usual stretch over the greatest, where most light goes 
 KINK = 3.0  # stretch of the map, in its median, from which e is not that of T: at a kink of phi the spline smooths the slopes
 NEGLIGIBLE = 0.05  # RMS of e, pixels, that is not corrected
 #: Options of the first map onto pixels in a projection, from which e is known: a quarter of the sites.
-ROUGHLY = {"tolerance": 1e-2, "most": 10, "levels": LEVELS[:-1]}
+ROUGHLY = {"tolerance": 1e-2, "most": 10, "levels": LEVELS[:-1], "times": 1}
 #: By what factor the point masses are fewer of which the first map with displaced ones is found, and its options.
-FEWER, FEW = 4, {"tolerance": 1e-2, "most": 30}
+FEWER, FEW = 4, {"tolerance": 1e-2, "most": 30, "times": 1}
 REPEATS = 4  # most fixed-point iterations; each reduces the error by a factor of about angle^2 / throw
 SLOPES = (1, 0), (0, 1)  # orders of derivatives
 CONVERGED = 1e-10  # largest expected change of a height in the next iteration, mm
@@ -166,7 +166,7 @@ def _displaced(
     if known is None and rough:
         some = masses.sites(source, half, FEWER)
         start = solve_displaced(source, some, half, potential, shift, **{**options, **FEW}, fewer=FEWER).potential
-    known = masses.sites(source, half) if known is None else known
+    known = masses.sites(source, half, times=options.get("times", 1)) if known is None else replace(known, mass=known.spots.mass)
     return solve_displaced(source, known, half, potential, shift, start=start, **options)
 
 

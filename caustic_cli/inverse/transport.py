@@ -23,7 +23,8 @@ The final phi is averaged over a few source cells, which keeps it convex and the
 
 Between separate bright regions phi has a kink, which that average smooths: light that crosses it falls into the dark gap.  So kinks
 have to be resolved more finely than masses: `Transport.finer` averages the same phi over smaller cells.  This solves no equation;
-time and memory are linear in the number of cells, processed in strips.
+time and memory are linear in the number of cells, processed in strips.  What light still falls there is made up for by the masses
+(`inverse.creases`).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ import numpy as np
 from scipy import ndimage
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse import multigrid
+from caustic_cli.inverse import creases, multigrid
 from caustic_cli.loading import OnDemand
 from caustic_cli.optics.bspline import GridSpline
 
@@ -55,6 +56,13 @@ STRICTER = 0.2  # tolerance of scattered sites in that of others: what is left i
 LEAST_ERROR = 4e-4  # of scattered sites, below which Newton's method mostly empties and fills a few cells at the edge
 #: Most Newton steps of scattered sites: a mirror in light at 75 degrees took 16 to 20; with 10 it had 1 to 3 times the error.
 SLOWLY = 30
+#: Mass of the lightest site that is a pixel beside brighter ones, in that of the lightest part of a pixel: light of a fainter one
+#: goes to these. Of dim pixels at edges that was half of the error of pictures with gaps; with 1/50 the raster misses cells.
+FAINT = 1.0 / 16.0
+#: Tolerance with these, and so for the masses that make up for creases, in that of others, and most steps to it.
+AGAIN, STEPS_AGAIN = 0.2, 10
+#: Part of the sites whose cells the raster misses up to which Newton's method goes on with them; more make it slow.
+FEW = 5e-3
 COVERED = 0.99  # part of the scattered sites that move by no more than the map is widened for its first prices
 LEAST = 128  # raster points along an axis
 LEVELS = (256, 64, 16, 4, 1)  # ratios of the number of sites on the finest level to that on each level
@@ -200,7 +208,18 @@ def cell_lines(half: tuple[float, float], cells: int) -> tuple[np.ndarray, np.nd
 
 
 def solve(
-    source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10, darkest=DARKEST, levels=LEVELS
+    source,
+    target,
+    source_half,
+    target_half,
+    *,
+    start=None,
+    smooth=1.5,
+    tolerance=5e-3,
+    most=10,
+    darkest=DARKEST,
+    levels=LEVELS,
+    times=1,
 ) -> Transport:
     """The optimal transport map from `source` to `target` for quadratic cost.
 
@@ -214,6 +233,7 @@ def solve(
         most: Newton steps per level.
         darkest: lower bound of the source over its mean; larger values need fewer steps.
         levels: ratios of the number of sites on the finest level to that on each, for a problem without an initial guess.
+        times: of `Transport.finer`, for which the masses are compensated; 1 without it.
 
     Raises:
         InputError: a density that is not 2-D, not finite, negative or black, or a size that is not positive.
@@ -235,18 +255,19 @@ def solve(
         goal = max(most_sites // fewer, 16)
         raster = [centres(_points(s * fewer**-0.5), h) for s, h in ((n, a), (m, b))]
         light = _light(f, 0.0, raster, a, b, sides)
-        old, sites = sites, _sites(pyramid, 1.0 / goal)
+        last = fewer == levels[-1]
+        old, sites = sites, _sites(pyramid, 1.0 / goal, g.shape if last and times > 1 else None)
         linear = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)  # prices of the map that stretches the rectangle
         if start is not None:
             psi = sites.prices(_resampled(start, (n, m), (a, b), raster), raster, light.inside)[0]
         else:
             psi = linear if old is None else _refined(psi, old, sites, raster, (a, b), sides)
-        enough = max(tolerance, MERGED) if fewer == levels[-1] else COARSE_TOLERANCE
+        enough = max(tolerance, MERGED) if last else COARSE_TOLERANCE
         found, error, taken = _newton(psi, sites, raster, light, enough, most)
         steps += taken
         failed = error > 10.0 * enough and (f.size > 1 or len(sides) > 0)  # Newton's method, in dark regions of the source
         if failed and start is not None:  # which were lit where the initial potential comes from
-            options = {"smooth": smooth, "tolerance": tolerance, "most": most, "darkest": darkest}
+            options = {"smooth": smooth, "tolerance": tolerance, "most": most, "darkest": darkest, "times": times}
             again = solve(source, target, source_half, target_half, **options)
             return replace(again, steps=steps + again.steps, seconds=time.perf_counter() - began)
         if failed:  # continuation from uniform light
@@ -254,12 +275,31 @@ def solve(
             steps += all_taken
             found, error = min((found, error), other, key=lambda pair: pair[1])
         psi = found
+    if times > 1:
+        spots, cell = creases.Spots((sites.y1, sites.y2), sites.mass, g > 0, (c, d)), _cell((n, m), (a, b), times)
+        psi, sites = _compensated(psi, sites, raster, light, spots, cell)
+        error, taken = 1.0, 1
+        if np.count_nonzero(~_seen(psi, sites, raster, light)) <= FEW * len(psi):
+            psi, error, taken = _newton(psi, sites, raster, light, AGAIN * tolerance, STEPS_AGAIN)
+            steps += taken
     psi, sites, error, taken = _without_empty(psi, sites, error, taken, raster, light, tolerance, most)
     return _map(psi, sites, (n, m), (a, b), smooth, error, steps + taken, began)
 
 
 def solve_displaced(
-    source, sites, source_half, potential, shift, *, smooth=1.5, tolerance=5e-3, most=SLOWLY, darkest=DARKEST, start=None, fewer=1
+    source,
+    sites,
+    source_half,
+    potential,
+    shift,
+    *,
+    smooth=1.5,
+    tolerance=5e-3,
+    most=SLOWLY,
+    darkest=DARKEST,
+    start=None,
+    fewer=1,
+    times=1,
 ) -> Transport:
     """The same onto scattered point masses, each displaced from its own place by -shift at the point of the source that a similar
     map sends to it.
@@ -270,6 +310,7 @@ def solve_displaced(
         source, source_half, smooth, tolerance, most, darkest: as of `solve`.
         start: potential of their map, roughly, there.
         fewer: by what factor the sites are fewer than those of the finest level.
+        times: as of `solve`.
     """
     began = time.perf_counter()
     kernels.blocks()
@@ -293,7 +334,26 @@ def solve_displaced(
     psi = moved.prices(phi, raster, light.inside)[0]
     enough = min(tolerance, max(LEAST_ERROR, STRICTER * tolerance))
     psi, error, taken = _newton(psi, moved, raster, light, enough, most)
+    if times > 1:
+        cell = _cell(shape, (a, b), times)
+        psi, moved = _compensated(psi, moved, raster, light, sites.spots, cell)
+        psi, error, more = _newton(psi, moved, raster, light, AGAIN * tolerance, STEPS_AGAIN)
+        taken += more
     return _map(psi, moved, shape, (a, b), smooth, error, taken, began)
+
+
+def _cell(shape: tuple[int, int], half: tuple[float, float], times: int) -> float:
+    """Width of source cells, mm, `times` smaller than these."""
+    return 2.0 * float(np.sqrt(half[0] * half[1] / (shape[0] * shape[1]))) / times
+
+
+def _compensated(psi, sites: _Sites, raster: list, light: _Light, spots: creases.Spots, cell: float) -> tuple:
+    """Prices, and the sites with masses that make up for what creases smoothed over cells of this width, mm, take; spots: what the
+    sites are of the picture."""
+    psi, _, (end, weight, *_) = _cells(psi, sites, raster, light)
+    q, p, weight = end[0::2], end[1::2], 0.5 * (weight[0::2] + weight[1::2])
+    along = weight * np.hypot(sites.y1[p] - sites.y1[q], sites.y2[p] - sites.y2[q])
+    return psi, replace(sites, mass=creases.compensated(spots, (p, q), cell * along))
 
 
 def _without_empty(psi, sites: _Sites, error: float, taken: int, raster: list, light: _Light, tolerance: float, most: int) -> tuple:
@@ -315,12 +375,12 @@ def _map(psi, sites: _Sites, shape, half, smooth: float, error: float, steps: in
     return Transport(potential - potential.mean(), x, y, error, len(psi), steps, time.perf_counter() - began, solved)
 
 
-def point_masses(source, picture, half, darkest=DARKEST, fewer=1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def point_masses(source, picture, half, darkest=DARKEST, fewer=1, times=1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The point masses of the finest level for a picture (k, l) with half sizes in mm, or about `fewer` times fewer: y1, y2 mm and
-    masses, (N,) each."""
+    masses, (N,) each; times: as of `solve`."""
     f, half = _density("source", source), _halves("target", half)
     most = _most_sites(_normalised(f, darkest, (1.0, 1.0)), f.size) // fewer
-    sites = _sites(_pyramid(_density("target", picture), half, most), 1.0 / max(most, 16))
+    sites = _sites(_pyramid(_density("target", picture), half, most), 1.0 / max(most, 16), np.shape(picture) if times > 1 else None)
     return sites.y1, sites.y2, sites.mass
 
 
@@ -461,10 +521,17 @@ def _pyramid(g: np.ndarray, half: tuple[float, float], goal: int) -> list:
         v, pixel = _halve(v), (2.0 * pixel[0], 2.0 * pixel[1])
 
 
-def _sites(pyramid: list, least: float) -> _Sites:
+def _parents(owner: np.ndarray) -> np.ndarray:
+    """Largest value in blocks of 2 x 2, (k, l) to half of that."""
+    owner = np.pad(owner, [(0, s % 2) for s in owner.shape], constant_values=-1)
+    return np.maximum(np.maximum(owner[0::2, 0::2], owner[1::2, 0::2]), np.maximum(owner[0::2, 1::2], owner[1::2, 1::2]))
+
+
+def _sites(pyramid: list, least: float, faint: tuple[int, int] | None = None) -> _Sites:
     """Blocks of pixels, each of at least a mass `least`, as points at their centroids.
 
-    From fine to coarse: a lighter block joins a site of its parent block of 2 x 2, or is left to the next level.
+    From fine to coarse: a lighter block joins a site of its parent block of 2 x 2, or is left to the next level.  Where the
+    picture has `faint` pixels, blocks of these of at least FAINT of that join no site beside them.
     """
     level = 0
     while level + 1 < len(pyramid) and pyramid[level][0][0].size > 32 / least:
@@ -474,6 +541,9 @@ def _sites(pyramid: list, least: float) -> _Sites:
     owner, sites = np.full(loose.shape[1:], -1), np.zeros((3, 0))
     while True:
         new = loose[0] >= least
+        if faint and owner.shape[0] <= faint[0]:
+            beside = np.repeat(np.repeat(_parents(np.where(new, 0, owner)), 2, 0), 2, 1)[: len(owner), : owner.shape[1]]
+            new |= (beside >= 0) & (owner < 0) & (loose[0] >= FAINT * least)
         if owner.size == 1 and not sites.size:
             new[:] = True
         joins = ~new & (owner >= 0) & (loose[0] > 0)
@@ -486,8 +556,7 @@ def _sites(pyramid: list, least: float) -> _Sites:
         if owner.size == 1:
             break
         loose = _halve(loose)
-        owner = np.pad(owner, [(0, s % 2) for s in owner.shape], constant_values=-1)
-        owner = np.maximum(np.maximum(owner[0::2, 0::2], owner[1::2, 0::2]), np.maximum(owner[0::2, 1::2], owner[1::2, 1::2]))
+        owner = _parents(owner)
     mass, pitch = sites[0], 0.5 * pixel[0]
     row, y2 = np.rint((sites[1] / mass - low[0]) / pitch).astype(np.int64), sites[2] / mass
     order = np.lexsort((y2, row))
@@ -521,11 +590,17 @@ def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, fl
     return phi[pad[0] : -pad[0], pad[1] : -pad[1]]
 
 
-def _merged(psi: np.ndarray, sites: _Sites, raster: list, light: _Light) -> tuple[np.ndarray, _Sites]:
-    """Prices and sites without those whose cells contain no raster point; their mass is added to the nearest ones."""
+def _seen(psi: np.ndarray, sites: _Sites, raster: list, light: _Light) -> np.ndarray:
+    """Sites whose cells contain a raster point, (N,) bool."""
     site = light.seen(sites.envelope(psi).on(*raster)[1])
     seen = np.zeros(len(psi), bool)
     seen[site[site >= 0]] = True
+    return seen
+
+
+def _merged(psi: np.ndarray, sites: _Sites, raster: list, light: _Light) -> tuple[np.ndarray, _Sites]:
+    """Prices and sites without those whose cells contain no raster point; their mass is added to the nearest ones."""
+    seen = _seen(psi, sites, raster, light)
     at = np.column_stack([sites.y1, sites.y2])
     nearest = spatial.cKDTree(at[seen]).query(at[~seen])[1]
     mass = sites.mass[seen] + np.bincount(nearest, sites.mass[~seen], np.count_nonzero(seen))

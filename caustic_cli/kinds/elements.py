@@ -10,6 +10,7 @@ from torch import Tensor
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import departure_bound, sphere_net
+from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.several_surfaces import SeveralSurfaces
 from caustic_cli.kinds.surface import OneSurface
 from caustic_cli.optics.resolution import Resolution
@@ -54,6 +55,10 @@ class FreeElements(SeveralSurfaces, AmongElements):
     @classmethod
     def applies(cls, s: Settings) -> bool:
         return any(element.free != "none" for element in s.elements)
+
+    @classmethod
+    def known_to_transport(cls, d: Defaults) -> bool:
+        return False
 
     @property
     def half_sizes(self) -> list[tuple[float, float]]:

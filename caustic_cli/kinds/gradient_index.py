@@ -271,8 +271,12 @@ class GradedLens(IndexPlate):
         d.fill_design(preconditioner="none")
 
     @classmethod
+    def known_to_transport(cls, d: Defaults) -> bool:
+        return False
+
+    @classmethod
     def default_stage(cls, d: Defaults) -> Table:
-        """With the net and the iterations of a surface alone."""
+        """With the net of a surface alone."""
         return cls.refinement(d, cls.creased(d, []))[-1]
 
     def solved(self, scene: Scene, goal: np.ndarray, cells: int, fixed: bool, seconds: float) -> InitialSurface:

@@ -11,6 +11,7 @@ from caustic_cli.config.settings import Settings
 from caustic_cli.inverse.graded_lens import INDEX
 from caustic_cli.inverse.objective import Evaluation, LossOfHeights, LossOfLens
 from caustic_cli.inverse.robust import robust_objective
+from caustic_cli.kinds.defaults import Defaults
 from caustic_cli.kinds.elements import AmongElements, FreeElements
 from caustic_cli.kinds.gradient_index import GradedElements, GradedLens, IndexPlate
 from caustic_cli.kinds.lenslet_array import LensletArray
@@ -47,6 +48,10 @@ class RobustSurface(OneSurface):
     @classmethod
     def further(cls, described: Described, scene: Scene) -> dict[str, Any]:
         return {"tolerances": _tolerances(described.settings)} | super().further(described, scene)
+
+    @classmethod
+    def known_to_transport(cls, d: Defaults) -> bool:
+        return False
 
     def objective(self, k: int, initial: Tensor) -> LossOfHeights:
         if k < len(self.stages) - 1:

@@ -270,8 +270,16 @@ class OneSurface(OnWaves):
     def refinement(cls, d: Defaults, creased: bool = False) -> list[Table]:
         """The stages after a transport start."""
         how = d.effort.creased if creased else d.effort.refinement
+        if creased and not cls.known_to_transport(d):
+            how = replace(how, plan=d.effort.joint)
         stages = partial(refinement, d.lens.control, d.rays, d.resolution, how, least=cls.least_rays(d))
         return on_spread(stages(d.fewer_blurred)) if cls.spread(d) else stages(d.fewer_rays)
+
+    @classmethod
+    def known_to_transport(cls, d: Defaults) -> bool:
+        """Whether what is asked for is the picture alone, of the surface that the transport finds."""
+        limited = d.design.max_slope or d.design.min_radius or d.lens.finish
+        return d.design.loss.strip() in ("rms", "rms-light") and not limited
 
     @classmethod
     def least_rays(cls, d: Defaults) -> int:
