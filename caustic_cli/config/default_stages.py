@@ -13,7 +13,7 @@ from typing import Any
 
 from caustic_cli.config.settings import Settings
 from caustic_cli.effort import STANDARD, Effort, Refinement
-from caustic_cli.inverse.initial_surface import COARSE, FEWEST
+from caustic_cli.inverse.initial_surface import FEWEST
 from caustic_cli.scene import Source
 from caustic_cli.schema.table import TABLE, default
 
@@ -142,7 +142,7 @@ def creased_control(pixels: int, degree: int, plan: Refinement, pieces: int = 1)
     preconditioner are three times as slow for such lengths.
     """
     spans = -(-plan.spans(pixels) // pieces)
-    step = math.ceil(spans / (FEWEST * COARSE))
+    step = -(-spans // FEWEST)
     spans = -(-spans // step) * step
 
     def points(spans: int) -> int:

@@ -45,8 +45,8 @@ ROUGH = 128
 #: spread of their light needs, and not too near to each other; fraction of the cells then needed that is accepted if it divides the
 #: finer ones.
 SITES, NEARLY = 4, 0.95
-#: Fewest cells on which it then is solved, in COARSE.
-FEWEST = 0.5
+#: Fewest cells on which it then is solved, unless `coarse` is less.
+FEWEST = 256
 #: Transport error and Newton steps per level for finer cells, which resolve it: 5e-3 left text with errors of 0.088 to 0.123.
 EXACT, STEPS = 5e-4, 30
 #: Largest peak-to-valley ratio of an interpolated control net to the surface.
@@ -369,7 +369,7 @@ def _refinement(cells: int, target: np.ndarray, coarse: int) -> int:
 
     A map on finer cells concentrates the light of a site in a point, so that sites have to be finer than bright pixels.
     """
-    most, needed = 2 * coarse, max(FEWEST * coarse, math.sqrt(SITES * np.count_nonzero(target)))
+    most, needed = 2 * coarse, max(min(FEWEST, coarse), math.sqrt(SITES * np.count_nonzero(target)))
     if cells <= most or needed > most:
         return 1
     whole = max(t for t in range(1, cells) if cells % t == 0 and cells >= NEARLY * needed * t)

@@ -87,6 +87,11 @@ class LensletArray(OneSurface):
         return cells_of(d.lens.packing, d.lens.array, d.lens.size).pieces
 
     @classmethod
+    def known_to_transport(cls, d: Defaults) -> bool:
+        """Not the borders of hexagonal lenslets, which cross knot spans, nor what smooth pictures lack on few cells."""
+        return super().known_to_transport(d) and super().has_creases(d) and d.lens.packing == "square"
+
+    @classmethod
     def has_creases(cls, d: Defaults) -> bool:
         return True  # at the borders of lenslets, and each of them has few knot spans
 
