@@ -73,9 +73,9 @@ class Work(NamedTuple):
 
 
 #: Seconds for a unit of each part on the reference machine.
-SECONDS = Work(5.0, 0.932, 0.0341, 0.0285, 0.0151, 0.0188, 0.00579)
+SECONDS = Work(5.06, 0.537, 0.0327, 0.0281, 0.0151, 0.019, 0.00588)
 #: MiB for a unit of each part of `memory_of`.
-MIBS = (800.0, 224.0, 89.4)
+MIBS = (748.0, 106.0, 93.0)
 #: Error of designs of the smoothest pictures, by judge.
 LEAST = {"waves": 0.02, "rays": 0.0}
 #: Judge and quality -> coefficients of `features_of`, and the standard deviation of the logarithm of the error about them.
@@ -83,9 +83,9 @@ ERRORS: dict[tuple[str, str], tuple[tuple[float, ...], float]] = {
     ("waves", "draft"): ((-1.124, 0.622, -0.03, -0.012, 0.0), 0.173),
     ("waves", "standard"): ((-3.08, 1.07, -0.1, 1.44, -0.78), 0.303),
     ("waves", "fine"): ((-0.64, 1.31, -0.14, 0.0, -1.14), 0.259),
-    ("rays", "draft"): ((-2.429, 0.311, 0.037, 0.001, 0.0), 0.197),
-    ("rays", "standard"): ((-2.524, 0.395, 0.298, 0.216, 0.0), 0.247),
-    ("rays", "fine"): ((-2.2, 0.399, 0.345, 0.0, 0.0), 0.18),
+    ("rays", "draft"): ((-2.342, 0.351, 0.323, 0.0, 0.221), 0.536),
+    ("rays", "standard"): ((-1.73, 0.528, 0.499, 0.0, -0.132), 0.204),
+    ("rays", "fine"): ((-2.165, 0.432, 0.386, 0.0, -0.142), 0.426),
 }
 
 
