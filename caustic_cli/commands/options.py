@@ -3,12 +3,10 @@ values."""
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import gc
 import inspect
 import math
-import os
 import re
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -22,6 +20,7 @@ import typer
 from caustic_cli.commands import console
 from caustic_cli.commands.console import ConsoleReporter
 from caustic_cli.errors import InputError, near, no_project
+from caustic_cli.loading import keep_freed_memory
 from caustic_cli.schema import checks, table
 from caustic_cli.schema.table import Setting
 
@@ -30,8 +29,6 @@ LISTS = {
     "glass": ("glasses", ("NAME", "n_d", "V_d", "g/cm^3", "steepest slope", "also"), "caustic_cli.scene.materials"),
     "preset": ("presets", (), "caustic_cli.config.presets"),
 }
-#: Parameters of mallopt(3), from glibc's malloc.h.
-TRIM_THRESHOLD, MMAP_MAX = -1, -4
 At = Annotated[
     str | None,
     typer.Option(
@@ -650,7 +647,7 @@ def start_torch(device: str, threads: int | None, say: ConsoleReporter):
         raise InputError(f"--device must be auto, cpu or cuda, got {device!r}")
     if threads is not None and not 1 <= threads <= 1024:
         raise InputError(f"--threads must be a whole number 1 to 1024, got {threads}")
-    _keep_freed_memory()
+    keep_freed_memory()
     import torch  # noqa: PLC0415
 
     if threads:
@@ -662,21 +659,6 @@ def start_torch(device: str, threads: int | None, say: ConsoleReporter):
     gc.freeze()  # the libraries' objects are not searched for unused ones again
     gc.enable()
     return choose_device(device, say)
-
-
-def _keep_freed_memory() -> None:
-    """Reuse freed memory for large arrays, and use huge pages: a third of the time of a design on a net of 3003 x 3003 points was
-    spent on clearing new pages (tests/benchmarks/README.md).
-
-    For glibc, whose malloc otherwise maps every large array anew (mallopt(3)); no effect elsewhere.  Call before torch is loaded.
-    """
-    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # read by torch
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError, TypeError):  # no glibc; no C library by that name
-        return
-    mallopt(TRIM_THRESHOLD, -1)
-    mallopt(MMAP_MAX, 0)
 
 
 def dtype_of(name: str):

@@ -277,11 +277,8 @@ def solve(
         psi = found
     if times > 1:
         spots, cell = creases.Spots((sites.y1, sites.y2), sites.mass, g > 0, (c, d)), _cell((n, m), (a, b), times)
-        psi, sites = _compensated(psi, sites, raster, light, spots, cell)
-        error, taken = 1.0, 1
-        if np.count_nonzero(~_seen(psi, sites, raster, light)) <= FEW * len(psi):
-            psi, error, taken = _newton(psi, sites, raster, light, AGAIN * tolerance, STEPS_AGAIN)
-            steps += taken
+        psi, sites, error, taken = _compensated(psi, sites, raster, light, spots, cell, tolerance, FEW)
+        steps += taken
     psi, sites, error, taken = _without_empty(psi, sites, error, taken, raster, light, tolerance, most)
     return _map(psi, sites, (n, m), (a, b), smooth, error, steps + taken, began)
 
@@ -336,8 +333,7 @@ def solve_displaced(
     psi, error, taken = _newton(psi, moved, raster, light, enough, most)
     if times > 1:
         cell = _cell(shape, (a, b), times)
-        psi, moved = _compensated(psi, moved, raster, light, sites.spots, cell)
-        psi, error, more = _newton(psi, moved, raster, light, AGAIN * tolerance, STEPS_AGAIN)
+        psi, moved, error, more = _compensated(psi, moved, raster, light, sites.spots, cell, tolerance)
         taken += more
     return _map(psi, moved, shape, (a, b), smooth, error, taken, began)
 
@@ -347,13 +343,22 @@ def _cell(shape: tuple[int, int], half: tuple[float, float], times: int) -> floa
     return 2.0 * float(np.sqrt(half[0] * half[1] / (shape[0] * shape[1]))) / times
 
 
-def _compensated(psi, sites: _Sites, raster: list, light: _Light, spots: creases.Spots, cell: float) -> tuple:
-    """Prices, and the sites with masses that make up for what creases smoothed over cells of this width, mm, take; spots: what the
-    sites are of the picture."""
+def _compensated(
+    psi, sites: _Sites, raster: list, light: _Light, spots: creases.Spots, cell: float, tolerance: float, few: float = 1.0
+) -> tuple:
+    """Prices, sites with masses that make up for what creases smoothed over cells take, error, and steps taken: by Newton's method
+    unless the raster misses more than a part `few` of the sites (an error of 1 then).
+
+    spots: what the sites are of the picture; cell: width, mm.
+    """
     psi, _, (end, weight, *_) = _cells(psi, sites, raster, light)
     q, p, weight = end[0::2], end[1::2], 0.5 * (weight[0::2] + weight[1::2])
     along = weight * np.hypot(sites.y1[p] - sites.y1[q], sites.y2[p] - sites.y2[q])
-    return psi, replace(sites, mass=creases.compensated(spots, (p, q), cell * along))
+    sites = replace(sites, mass=creases.compensated(spots, (p, q), cell * along))
+    if few < 1.0 and np.count_nonzero(~_seen(psi, sites, raster, light)) > few * len(psi):
+        return psi, sites, 1.0, 1
+    psi, error, taken = _newton(psi, sites, raster, light, AGAIN * tolerance, STEPS_AGAIN)
+    return psi, sites, error, taken
 
 
 def _without_empty(psi, sites: _Sites, error: float, taken: int, raster: list, light: _Light, tolerance: float, most: int) -> tuple:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.loss_terms import parse
-from caustic_cli.loading import OnDemand
+from caustic_cli.loading import OnDemand, give_back_freed_memory
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.system import trace_arguments
@@ -109,6 +109,7 @@ class LensEvaluation:
         exposure, figures = self.rays(heights, noise)
         if not self.refined:
             return Seen(exposure, None, figures)
+        give_back_freed_memory()
         problem = self.problem
         light, more = by_waves.wave_figures(
             *trace_arguments(problem.scene, self.field, heights.to(problem.device)),
