@@ -8,7 +8,7 @@ Notation
 
 The map of the sites jumps from p to q at the border; that of the averaged phi and its spline takes about two cells.  Light of
 WIDTH h l lands along the line from p to q at POSITIONS, half of which each of the sites is short of: pixels at gaps are too dark by
-some per cent, which was two thirds of the error of such pictures, and their neighbours too bright.  Between sites of one region
+some per cent, which was 0.6 of the square of a flame's error, and their neighbours too bright.  Between sites of one region
 what a pixel loses it receives.  The masses compensate that to first order; the light in the gaps itself remains there.
 """
 

@@ -57,7 +57,8 @@ LEAST_ERROR = 4e-4  # of scattered sites, below which Newton's method mostly emp
 #: Most Newton steps of scattered sites: a mirror in light at 75 degrees took 16 to 20; with 10 it had 1 to 3 times the error.
 SLOWLY = 30
 #: Mass of the lightest site that is a pixel beside brighter ones, in that of the lightest part of a pixel: light of a fainter one
-#: goes to these. Of dim pixels at edges that was half of the error of pictures with gaps; with 1/50 the raster misses cells.
+#: goes to these. With 4 sites a pixel a flame had an error of 0.053 without such sites, and 0.017 with them; with 1/50 the raster
+#: misses cells (0.020 on a net on which 1/16 has 0.015).
 FAINT = 1.0 / 16.0
 #: Tolerance with these, and so for the masses that make up for creases, in that of others, and most steps to it.
 AGAIN, STEPS_AGAIN = 0.2, 10
